@@ -304,31 +304,31 @@ def grid_centers(points: Array, edge: float) -> tuple[Array, float]:
 # Solids of meshes and objects.
 
 
-def hull(points: Array, where: str) -> Solid:
+def hull(points: Array, location: str) -> Solid:
     """Return the convex hull of points (k, 3) [m].
 
     Args:
         points: The points.
-        where: File and key for error messages.
+        location: File and key for error messages.
 
     Raises:
         DescriptionError: The points are too few, not finite, or in a plane.
     """
     if points.ndim != 2 or len(points) < 4:
-        raise DescriptionError(f"{where}: found {len(points)} points, expected at least 4")
+        raise DescriptionError(f"{location}: found {len(points)} points, expected at least 4")
     if not np.isfinite(points).all():
-        raise DescriptionError(f"{where}: points are not finite; expected finite numbers")
+        raise DescriptionError(f"{location}: points are not finite; expected finite numbers")
     if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-9) < 3:
-        raise DescriptionError(f"{where}: points are coplanar; expected a body")
+        raise DescriptionError(f"{location}: points are coplanar; expected a body")
     with optional_import("convex hulls"):
         from scipy.spatial import ConvexHull, QhullError
 
     try:
         faces = ConvexHull(points)
     except QhullError as error:
-        raise DescriptionError(f"{where}: hull has no volume; expected a body") from error
+        raise DescriptionError(f"{location}: hull has no volume; expected a body") from error
     if faces.volume < 1e-9 / 6:  # [m^3]
-        raise DescriptionError(f"{where}: hull has no volume; expected a body")
+        raise DescriptionError(f"{location}: hull has no volume; expected a body")
     directions = faces.equations[:, :3]
     a, b, c = (points[faces.simplices[:, i]] for i in range(3))
     is_inward = (np.cross(b - a, c - a) * directions).sum(axis=1) < 0
@@ -382,7 +382,7 @@ FLAT_THICKNESS = 1e-3
 """Thickness that is given to a flat piece of a mesh [m]."""
 
 
-def mesh_hulls(shape: MeshShape, where: str) -> list[PosedSolid]:
+def mesh_hulls(shape: MeshShape, location: str) -> list[PosedSolid]:
     """Return the convex hulls of the pieces of a mesh, with their (4, 4) poses in its frame.
 
     Flat pieces smaller than `MAX_SPECK_SIZE`, which scanners produce, are ignored. Other flat
@@ -402,7 +402,7 @@ def mesh_hulls(shape: MeshShape, where: str) -> list[PosedSolid]:
             points = np.concatenate([points - offset, points + offset])
         pose = np.eye(4)
         pose[:3, 3] = points.mean(axis=0)
-        piece = f"{where}: piece {number} of {len(shape.pieces)}"
+        piece = f"{location}: piece {number} of {len(shape.pieces)}"
         solids.append((hull(points - pose[:3, 3], piece), pose))
     return solids
 

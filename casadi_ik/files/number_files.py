@@ -42,11 +42,11 @@ READ_ERRORS = (
 """Exceptions that numpy and zipfile raise for damaged or encrypted files."""
 
 
-def check_unpacked_size(where: str, size: int, max_size: int) -> None:
+def check_unpacked_size(location: str, size: int, max_size: int) -> None:
     """Refuse data that need more memory than allowed.
 
     Args:
-        where: File and key, for the message.
+        location: File and key, for the message.
         size: Uncompressed size [bytes].
         max_size: Largest allowed size [bytes].
 
@@ -56,7 +56,7 @@ def check_unpacked_size(where: str, size: int, max_size: int) -> None:
     allowed = scaled_limit(max_size)
     if size > allowed:
         raise DescriptionError(
-            f"{where}: unpacks to {size} bytes; expected at most {allowed} {RAISE_HINT}"
+            f"{location}: unpacks to {size} bytes; expected at most {allowed} {RAISE_HINT}"
         )
 
 
@@ -105,45 +105,45 @@ APPEARANCE_TAGS = ("library_images", "library_effects", "library_materials", "bi
 """COLLADA elements that describe the appearance of a mesh."""
 
 
-def read_mesh(path: Path, where: str) -> tuple[Array, NDArray[np.int64]]:
+def read_mesh(path: Path, location: str) -> tuple[Array, NDArray[np.int64]]:
     """Return the vertices (k, 3) and triangles (t, 3) of a mesh file, its parts combined.
 
     Vertices that no triangle uses are dropped.
 
     Args:
         path: STL, OBJ, PLY, DAE, OFF or GLB.
-        where: File and key that name the mesh, for the message.
+        location: File and key that name the mesh, for the message.
 
     Raises:
         DescriptionError: The file does not exist, has no triangles, or is too large.
         MissingExtraError: The package that reads meshes is not installed.
     """
     if not path.is_file():
-        raise DescriptionError(f"{where}: no such file {str(path)!r}")
+        raise DescriptionError(f"{location}: no such file {str(path)!r}")
     kind = path.suffix.lower()
-    where = f"{where}: {path.name}"
+    location = f"{location}: {path.name}"
     if kind not in MESH_FORMATS:
         raise DescriptionError(
-            f"{where}: found {kind!r}, expected one of {', '.join(MESH_FORMATS)}"
+            f"{location}: found {kind!r}, expected one of {', '.join(MESH_FORMATS)}"
         )
-    data = read_bytes(path, where, scaled_limit(LIMITS.mesh_bytes), RAISE_HINT)
+    data = read_bytes(path, location, scaled_limit(LIMITS.mesh_bytes), RAISE_HINT)
     try:
         points, triangles = _parse_mesh(data, kind[1:])
     except MissingExtraError:
         raise
     except Exception as error:  # libraries raise exceptions of any type for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise DescriptionError(f"{where}: cannot be read: {reason}") from error
+        raise DescriptionError(f"{location}: cannot be read: {reason}") from error
     if len(triangles) > scaled_limit(LIMITS.mesh_faces):
         hint = raise_hint(len(triangles), LIMITS.mesh_faces)
         expected = f"at most {scaled_limit(LIMITS.mesh_faces)} {hint}"
-        raise DescriptionError(f"{where}: found {len(triangles)} triangles, expected {expected}")
+        raise DescriptionError(f"{location}: found {len(triangles)} triangles, expected {expected}")
     if not len(points):
-        raise DescriptionError(f"{where}: the mesh is empty; expected triangles")
+        raise DescriptionError(f"{location}: the mesh is empty; expected triangles")
     bound = LIMITS.mesh_coordinate
     if not (np.abs(points) <= bound).all():
         raise DescriptionError(
-            f"{where}: a vertex is not finite or beyond {bound:g}; expected finite coordinates"
+            f"{location}: a vertex is not finite or beyond {bound:g}; expected finite coordinates"
         )
     return points, triangles
 
@@ -239,7 +239,7 @@ class _Header:
     form: str
 
 
-def read_points(path: Path, where: str) -> Array:
+def read_points(path: Path, location: str) -> Array:
     """Read the finite points (k, 3) of a file, in the unit of the file.
 
     Args:
@@ -247,7 +247,7 @@ def read_points(path: Path, where: str) -> Array:
             depth camera, or more columns, whose first three are used; ``.ply`` and ``.pcd``
             (text, binary or compressed); ``.xyz``, ``.txt``, ``.csv``: x, y and z in the first
             three columns, or in the columns that a header line names.
-        where: File and key, for the message.
+        location: File and key, for the message.
 
     Raises:
         DescriptionError: The file does not exist, is damaged, or holds no points.
@@ -263,10 +263,10 @@ def read_points(path: Path, where: str) -> Array:
     if reader is None:
         suffixes = ", ".join(readers)
         raise DescriptionError(
-            f"{where}: found {path.name!r}, expected a name that ends in {suffixes}"
+            f"{location}: found {path.name!r}, expected a name that ends in {suffixes}"
         )
     if not path.is_file():
-        raise DescriptionError(f"{where}: no such file {str(path)!r}")
+        raise DescriptionError(f"{location}: no such file {str(path)!r}")
     try:
         if path.stat().st_size > scaled_limit(LIMITS.cloud_bytes):
             raise ValueError(
@@ -274,16 +274,16 @@ def read_points(path: Path, where: str) -> Array:
             )
         points = reader(path)
     except DescriptionError as error:
-        raise DescriptionError(f"{where}: {error}") from error
+        raise DescriptionError(f"{location}: {error}") from error
     except OSError as error:
-        raise DescriptionError(f"{where}: {path.name}: {error.strerror or error}") from error
+        raise DescriptionError(f"{location}: {path.name}: {error.strerror or error}") from error
     except (*READ_ERRORS, TypeError, LookupError, StopIteration) as error:
         reason = " ".join(str(error).split())
-        raise DescriptionError(f"{where}: {path.name} cannot be read: {reason}") from error
-    return finite_points(points, f"{where}: {path.name}")
+        raise DescriptionError(f"{location}: {path.name} cannot be read: {reason}") from error
+    return finite_points(points, f"{location}: {path.name}")
 
 
-def finite_points(points: np.ndarray, where: str) -> Array:
+def finite_points(points: np.ndarray, location: str) -> Array:
     """Return the finite rows of points (k, 3); depth cameras mark rows without a distance by NaN.
 
     Raises:
@@ -291,10 +291,10 @@ def finite_points(points: np.ndarray, where: str) -> Array:
     """
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
         description = f"{points.dtype} of shape {points.shape}"
-        raise DescriptionError(f"{where}: found {description}, expected numbers (k, 3)")
+        raise DescriptionError(f"{location}: found {description}, expected numbers (k, 3)")
     finite = np.asarray(points[np.isfinite(points).all(axis=1)], dtype=np.float64)
     if not len(finite):
-        raise DescriptionError(f"{where}: found no points, expected at least one")
+        raise DescriptionError(f"{location}: found no points, expected at least one")
     return finite
 
 

@@ -61,12 +61,12 @@ class _UniqueKeyLoader(_SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def read_bytes(path: Path, where: str, max_size: int, note: str = "") -> bytes:
+def read_bytes(path: Path, location: str, max_size: int, note: str = "") -> bytes:
     """Read a file.
 
     Args:
         path: The file.
-        where: Name of the file in messages.
+        location: Name of the file in messages.
         max_size: Largest size [bytes].
         note: Hint how to raise the limit, for the message.
 
@@ -78,10 +78,10 @@ def read_bytes(path: Path, where: str, max_size: int, note: str = "") -> bytes:
             data = stream.read(max_size + 1)
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise DescriptionError(f"{where}: cannot be read: {reason}") from error
+        raise DescriptionError(f"{location}: cannot be read: {reason}") from error
     if len(data) > max_size:
         size = f"{max_size / 2**20:.3g} MiB {note}".rstrip()
-        raise DescriptionError(f"{where}: cannot be read: is larger than {size}")
+        raise DescriptionError(f"{location}: cannot be read: is larger than {size}")
     return data
 
 
@@ -109,9 +109,9 @@ def parse_yaml(path: Path) -> Any:
         data = yaml.load(text, Loader=_UniqueKeyLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        where = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
+        location = f":{mark.line + 1}:{mark.column + 1}" if mark is not None else ""
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise DescriptionError(f"{path}{where}: not valid YAML: {problem}") from error
+        raise DescriptionError(f"{path}{location}: not valid YAML: {problem}") from error
     except (ValueError, OverflowError, RecursionError) as error:  # an impossible date
         raise DescriptionError(f"{path}: not valid YAML: {error}") from error
     try:
@@ -268,10 +268,10 @@ def convert_entry(data: Any, type_: type[T], path: Path) -> T:
     try:
         return msgspec.convert(data, type_)
     except msgspec.ValidationError as error:
-        text, _, location = str(error).partition(" - at `")
-        in_key = location.startswith("key` in `")
+        text, _, msgspec_path = str(error).partition(" - at `")
+        in_key = msgspec_path.startswith("key` in `")
         key, value = _invalid_item(
-            data, type_, location.removeprefix("key` in `")[1:-1], str(error)
+            data, type_, msgspec_path.removeprefix("key` in `")[1:-1], str(error)
         )
         text = f"{text[0].lower()}{text[1:]}"
         if in_key:
@@ -286,7 +286,7 @@ def convert_entry(data: Any, type_: type[T], path: Path) -> T:
         raise DescriptionError(f"{path}: {key or '(top level)'}: {text}") from error
 
 
-def _invalid_item(data: Any, type_: type[Any], location: str, message: str) -> tuple[str, Any]:
+def _invalid_item(data: Any, type_: type[Any], msgspec_path: str, message: str) -> tuple[str, Any]:
     """Return key and value that a validation error is about.
 
     msgspec writes ``[...]`` for the keys of a mapping with free names; which of them is invalid is
@@ -294,7 +294,7 @@ def _invalid_item(data: Any, type_: type[Any], location: str, message: str) -> t
     """
     key, value, trimmed = "", data, data
     steps: list[Any] = []
-    for part in re.findall(r"\[\.\.\.\]|\[\d+\]|\.[^.\[]+", location):
+    for part in re.findall(r"\[\.\.\.\]|\[\d+\]|\.[^.\[]+", msgspec_path):
         if part == "[...]" and isinstance(value, dict):
             for name in value:
                 single = _replace_item(trimmed, steps, {name: value[name]})

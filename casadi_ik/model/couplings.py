@@ -44,24 +44,24 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
     monotone: ClassVar[bool] = True
     periodic: ClassVar[bool] = False
 
-    def check(self, where: str) -> None:
+    def check(self, location: str) -> None:
         """Check that the numbers describe a mechanism.
 
         Args:
-            where: File, joint and key, for the message.
+            location: File, joint and key, for the message.
 
         Raises:
             DescriptionError: The numbers describe no mechanism.
         """
 
-    def check_stroke(self, name: str, lower: float, upper: float, where: str) -> None:
+    def check_stroke(self, name: str, lower: float, upper: float, location: str) -> None:
         """Check that the mechanism stays assembled over a motor's stroke.
 
         Args:
             name: Name of the motor.
             lower: Lower limit of the motor.
             upper: Upper limit of the motor.
-            where: File, joint and key, for the message.
+            location: File, joint and key, for the message.
 
         Raises:
             DescriptionError: The motor leaves the stroke of the mechanism.
@@ -69,7 +69,7 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
         low, high = self.stroke
         if not low <= lower < upper <= high:
             raise DescriptionError(
-                f"{where}: the range of {name!r} is {lower:.6g} to {upper:.6g} "
+                f"{location}: the range of {name!r} is {lower:.6g} to {upper:.6g} "
                 f"{self.source_unit}, expected within {self.stroke_text}"
             )
 
@@ -107,10 +107,10 @@ class Linear(CouplingKind, frozen=True, tag="linear"):
     ratio: PureNumber = 1.0
     offset: AnyValue = 0.0
 
-    def check(self, where: str) -> None:
+    def check(self, location: str) -> None:
         """Check that the joint moves."""
         if self.ratio == 0:
-            raise DescriptionError(f"{where}.ratio: is zero; expected a joint that moves")
+            raise DescriptionError(f"{location}.ratio: is zero; expected a joint that moves")
 
     @property
     def slope(self) -> tuple[float, float]:
@@ -189,14 +189,14 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
     monotone: ClassVar[bool] = False
     periodic: ClassVar[bool] = True
 
-    def check(self, where: str) -> None:
+    def check(self, location: str) -> None:
         """Check that the linkage closes in its reference pose."""
         # The rod and the coupler span the distance from the crank's pin to the rod's pivot.
         p, q, g, h = self.p, self.q, self.g, self.h
         span = math.sqrt(max(p * p + g * g - 2 * p * g * math.cos(self.phi_0), 0.0))
         if not abs(q - h) < span < q + h:
             raise DescriptionError(
-                f"{where}.phi_0: at {self.phi_0:.6g} rad q and h cannot span {span:.6g} m; "
+                f"{location}.phi_0: at {self.phi_0:.6g} rad q and h cannot span {span:.6g} m; "
                 f"expected a pose in which the linkage closes, neither stretched nor folded"
             )
 
@@ -236,11 +236,11 @@ class Polynomial(CouplingKind, frozen=True, tag="polynomial"):
 
     monotone: ClassVar[bool] = False
 
-    def check(self, where: str) -> None:
+    def check(self, location: str) -> None:
         """Check that the joint moves."""
         if not any(self.coefficients[1:]):
             raise DescriptionError(
-                f"{where}.coefficients: all but the first are zero; expected a joint that moves"
+                f"{location}.coefficients: all but the first are zero; expected a joint that moves"
             )
 
     def followed(self, source: Array) -> Array:

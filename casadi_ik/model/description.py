@@ -179,8 +179,8 @@ class RobotDescription:
 
     @cached_property
     def _ranges(self) -> tuple[Array, Array]:
-        where = f"robot {self.name!r}"
-        lower, upper = motor_ranges(self.movable, self.actuators, self.home, where)
+        location = f"robot {self.name!r}"
+        lower, upper = motor_ranges(self.movable, self.actuators, self.home, location)
         return read_only(lower), read_only(upper)
 
     @cached_property

@@ -42,20 +42,20 @@ def arm_from_file(entry: ArmFromFile, key: str, description: Path) -> RobotPart:
         DescriptionError: The message names file, link or joint, and the required change.
         MissingExtraError: The package that reads the file's format is not installed.
     """
-    tree, where, root = _open_tree(entry, key, description)
+    tree, location, root = _open_tree(entry, key, description)
     tip = entry.tip
     if tip is None:
         leaves = leaf_links(tree, root)
         if len(leaves) != 1:
             raise DescriptionError(
-                f"{where}.tip: missing; {tree.path.name} ends in several links; expected one of "
+                f"{location}.tip: missing; {tree.path.name} ends in several links; expected one of "
                 + ", ".join(leaves)
             )
         tip = leaves[0]
-    tree.require_link(tip, f"{where}.tip: {tree.path.name}")
-    chain = tree.chain(root, tip, f"{where}.tip: {tree.path.name}")
+    tree.require_link(tip, f"{location}.tip: {tree.path.name}")
+    chain = tree.chain(root, tip, f"{location}.tip: {tree.path.name}")
     source = {key: f"{tree.path.name}, links {root} to {tip}"}
-    return _part(tree, entry, (chain, ()), LinkFrame(link=tip), source, where)
+    return _part(tree, entry, (chain, ()), LinkFrame(link=tip), source, location)
 
 
 def hand_from_file(
@@ -73,10 +73,10 @@ def hand_from_file(
         DescriptionError: The message names file, link or joint, and the required change.
         MissingExtraError: The package that reads the file's format is not installed.
     """
-    tree, where, root = _open_tree(entry, key, description)
+    tree, location, root = _open_tree(entry, key, description)
     palm = palm_frame(entry.palm or root)
-    tree.require_link(palm.link, f"{where}.palm: {tree.path.name}")
-    chain = tree.chain(root, palm.link, f"{where}.palm: {tree.path.name}")
+    tree.require_link(palm.link, f"{location}.palm: {tree.path.name}")
+    chain = tree.chain(root, palm.link, f"{location}.palm: {tree.path.name}")
     hand = tuple(joints_below(tree, palm.link))
     hand_links = {palm.link, *(joint.child for joint in hand)}
     for name, pad in pads.items():
@@ -88,8 +88,8 @@ def hand_from_file(
                 f"{tree.path.name}; expected another link or another palm"
             )
     source = {key: f"{tree.path.name}, palm {palm.link}"}
-    part = _part(tree, entry, (chain, hand), palm, source, where)
-    return replace(part, where=f"{description}: ", pads=pads)
+    part = _part(tree, entry, (chain, hand), palm, source, location)
+    return replace(part, location=f"{description}: ", pads=pads)
 
 
 def palm_frame(palm: str | LinkFrame) -> LinkFrame:
@@ -99,12 +99,12 @@ def palm_frame(palm: str | LinkFrame) -> LinkFrame:
 
 def _open_tree(entry: Entry, key: str, description: Path) -> tuple[RobotTree, str, str]:
     """Return the tree of the entry's file, the prefix of messages, and the part's root link."""
-    path, where = description.parent / Path(entry.file).expanduser(), f"{description}: {key}"
+    path, location = description.parent / Path(entry.file).expanduser(), f"{description}: {key}"
     if not path.exists():
-        raise DescriptionError(f"{where}.file: {path}: no such file")
+        raise DescriptionError(f"{location}.file: {path}: no such file")
     tree = read_tree(path, entry.xacro)
-    root = tree.require_link(entry.root or tree.root, f"{where}.root: {tree.path.name}")
-    return tree, where, root
+    root = tree.require_link(entry.root or tree.root, f"{location}.root: {tree.path.name}")
+    return tree, location, root
 
 
 def _part(
@@ -113,7 +113,7 @@ def _part(
     chosen: tuple[tuple[TreeJoint, ...], tuple[TreeJoint, ...]],
     end: LinkFrame,
     source: dict[str, str],
-    where: str,
+    location: str,
 ) -> RobotPart:
     """Return the chosen joints as a part.
 
@@ -123,10 +123,10 @@ def _part(
         chosen: Joints of the arm (or above the palm), and joints of the hand.
         end: Frame of the tip or palm.
         source: Source of the numbers by tag.
-        where: Description and key, for messages.
+        location: Description and key, for messages.
     """
     root = chosen[0][0].parent if chosen[0] else end.link
-    joints, actuators = _PartJoints(tree, entry, *chosen, where).convert()
+    joints, actuators = _PartJoints(tree, entry, *chosen, location).convert()
     links = [root, *(joint.child for joint in joints)]
     shapes = NO_SHAPES
     if not tree.shapes.meshes & set(links):  # simple shapes alone would be incomplete
@@ -135,7 +135,7 @@ def _part(
         shapes = link_shapes(CollisionEntry(links=entries), links, tree.path)
     frame = frame_matrix(end)
     return RobotPart(
-        *(tree.path.stem, f"{where}: ", root, joints, actuators, source, end.link, frame, {}),
+        *(tree.path.stem, f"{location}: ", root, joints, actuators, source, end.link, frame, {}),
         shapes,
     )
 
@@ -149,20 +149,20 @@ class _PartJoints:
         entry: Entry,
         chain: tuple[TreeJoint, ...],
         hand: tuple[TreeJoint, ...],
-        where: str,
+        location: str,
     ) -> None:
         self._tree = tree
-        self._where = f"{where}: {tree.path.name}"
-        self._key = where
+        self._where = f"{location}: {tree.path.name}"
+        self._key = location
         self._arm = {joint.name for joint in chain}
         self._joints = {joint.name: joint for joint in (*chain, *hand)}
         for key, names in (("locked", entry.locked), ("limits", entry.limits)):
             for name in names:
-                tree.require_joint(name, f"{where}.{key}: {tree.path.name}")
+                tree.require_joint(name, f"{location}.{key}: {tree.path.name}")
         for name, (low, high) in entry.limits.items():
             if not low < high:
                 raise DescriptionError(
-                    f"{where}.limits.{name}: lower {low:.6g} is not below upper {high:.6g}"
+                    f"{location}.limits.{name}: lower {low:.6g} is not below upper {high:.6g}"
                 )
         self._locked, self._stated = entry.locked, entry.limits
         self._ranges: dict[str, tuple[float, float]] = {}

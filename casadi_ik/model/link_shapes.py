@@ -35,8 +35,11 @@ def srdf_pairs(path: Path) -> list[tuple[tuple[str, str], str]]:
         raise DescriptionError(f"{path}: found <{element.tag}>, expected <robot> of an SRDF")
     pairs: list[tuple[tuple[str, str], str]] = []
     for i, pair in enumerate(element.iter("disable_collisions")):
-        where = f"{path}: disable_collisions[{i}]"
-        links = required_attribute(pair, "link1", where), required_attribute(pair, "link2", where)
+        location = f"{path}: disable_collisions[{i}]"
+        links = (
+            required_attribute(pair, "link1", location),
+            required_attribute(pair, "link2", location),
+        )
         pairs.append((links, f"{path.name}: {pair.get('reason', 'no reason given')}"))
     return pairs
 
@@ -183,11 +186,11 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
     """
     if entry is None:
         return NO_SHAPES
-    names, where = list(links), str(path)
+    names, location = list(links), str(path)
     capsules: list[LinkCapsule] = []
     solids: list[LinkSolid] = []
     for link, shapes in entry.links.items():
-        require_name(link, names, "link", f"{where}: collision.links.{link}")
+        require_name(link, names, "link", f"{location}: collision.links.{link}")
         for shape in shapes:
             covers = -1
             if isinstance(shape, LinkBoxEntry | LinkCylinderEntry):
@@ -196,7 +199,7 @@ def link_shapes(entry: CollisionEntry | None, links: Iterable[str], path: Path) 
             capsules += [LinkCapsule(link, *capsule, covers) for capsule in capsules_of(shape)]
     touching: list[Touching] = []
     for i, pair in enumerate(entry.touching):
-        key = f"{where}: collision.touching[{i}]"
+        key = f"{location}: collision.touching[{i}]"
         for link in pair.links:
             require_name(link, names, "link", f"{key}.links")
         if not pair.reason.strip():

@@ -75,14 +75,14 @@ def parents_first(joints: Iterable[L], root: str) -> tuple[L, ...]:
     return tuple(ordered)
 
 
-def require_name(name: str, names: Collection[str], noun: str, where: str) -> str:
+def require_name(name: str, names: Collection[str], noun: str, location: str) -> str:
     """Return the name of a link or joint if it exists.
 
     Raises:
         DescriptionError: The name does not exist; the message lists those that do.
     """
     if name not in names:
-        raise DescriptionError(f"{where}: unknown {noun} {name!r}; known: {', '.join(names)}")
+        raise DescriptionError(f"{location}: unknown {noun} {name!r}; known: {', '.join(names)}")
     return name
 
 

@@ -17,14 +17,13 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.imported_parts import hand_from_file
 from casadi_ik.model.joining import (
     assign_wrist_to_arm,
-    body_from_file,
-    body_from_parts,
     build_fingers,
     fixed_joint,
     join_parts,
     load_part,
 )
 from casadi_ik.model.link_shapes import link_shapes
+from casadi_ik.model.multi_arm import body_from_file, body_from_parts
 from casadi_ik.model.parts import (
     RobotPart,
     part_from_file,
@@ -148,7 +147,7 @@ def _arm_hand(
     home: dict[str, float],
     units: dict[str, str],
     sources: dict[str, str],
-    where: str,
+    location: str,
 ) -> RobotDescription:
     """Return the robot of an arm (or None) and a hand on it."""
     if arm is not None:
@@ -161,12 +160,12 @@ def _arm_hand(
         parts.insert(0, (arm.name, arm))
     home = home or {motor: value for _, part in parts for motor, value in part.home.items()}
     palms = {hand.tip_link}
-    robot, flat = join_parts(name, root, joints, parts, palms, home, units, sources, where)
+    robot, flat = join_parts(name, root, joints, parts, palms, home, units, sources, location)
     if thumb is None and hand.thumb in fingers:
         thumb = hand.thumb
     return replace(
         robot,
-        fingers=build_fingers(fingers, thumb, hand, flat, f"{where}: "),
+        fingers=build_fingers(fingers, thumb, hand, flat, f"{location}: "),
         named_thumb=thumb,
         palm_link=hand.tip_link,
         palm_placement=read_only(hand.tip),

@@ -35,7 +35,7 @@ SEARCH = RangeSearch()
 
 
 def motor_ranges(
-    joints: Sequence[Joint], actuators: Sequence[Actuator], reference: Array, where: str
+    joints: Sequence[Joint], actuators: Sequence[Actuator], reference: Array, location: str
 ) -> tuple[Array, Array]:
     """Return the limits (n,) of the motors that imply those of the joints.
 
@@ -46,7 +46,7 @@ def motor_ranges(
         joints: Movable joints.
         actuators: The motors.
         reference: (n,) positions of the motors.
-        where: Name of the robot in messages.
+        location: Name of the robot in messages.
 
     Raises:
         DescriptionError: A motor has no position at which all of its joints are within limits.
@@ -58,7 +58,7 @@ def motor_ranges(
         if interval is None:
             names = ", ".join(repr(joint.name) for joint, _ in followers)
             raise DescriptionError(
-                f"{where}: actuators.{actuator.name}: limits: no position from "
+                f"{location}: actuators.{actuator.name}: limits: no position from "
                 f"{actuator.lower:.6g} to {actuator.upper:.6g} keeps its joints ({names}) within "
                 "their limits"
             )

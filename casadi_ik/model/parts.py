@@ -53,61 +53,63 @@ def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: P
             )
         motor = next((actuator for actuator in actuators if actuator.name == coupling.of), None)
         if motor is not None:
-            where = f"{path}: joint {joint.name!r}: coupling"
-            coupling.check_stroke(motor.name, motor.lower, motor.upper, where)
+            location = f"{path}: joint {joint.name!r}: coupling"
+            coupling.check_stroke(motor.name, motor.lower, motor.upper, location)
 
 
 def _check_coupling(
     joint: Joint, by_name: dict[str, Joint], actuators: set[str], path: Path
 ) -> None:
     """Check that a joint's couplings lead to an actuator."""
-    where = f"{path}: joint {joint.name!r}"
+    location = f"{path}: joint {joint.name!r}"
     followed, current = [joint.name], joint
     while current.coupling is not None:
         source = current.coupling.of
         if source in followed:
             cycle = " -> ".join([*followed, source])
-            raise DescriptionError(f"{where}: coupling.of: is a cycle {cycle}")
+            raise DescriptionError(f"{location}: coupling.of: is a cycle {cycle}")
         if source in actuators:
             return
         if source not in by_name:
             raise DescriptionError(
-                f"{where}: coupling.of: unknown joint or actuator {source!r}; known: "
+                f"{location}: coupling.of: unknown joint or actuator {source!r}; known: "
                 + ", ".join([*by_name, *sorted(actuators - set(by_name))])
             )
         followed.append(source)
         current = by_name[source]
     if current.name not in actuators:
         raise DescriptionError(
-            f"{where}: coupling: missing; expected one, or {current.name!r} under 'actuators'"
+            f"{location}: coupling: missing; expected one, or {current.name!r} under 'actuators'"
         )
 
 
-def require_unique(names: Iterable[str], where: str) -> None:
+def require_unique(names: Iterable[str], location: str) -> None:
     """Refuse names that appear twice."""
     unique: set[str] = set()
     for name in names:
-        require_usable_name(name, where)
+        require_usable_name(name, location)
         if name in unique:
-            raise DescriptionError(f"{where}: {name!r} appears twice")
+            raise DescriptionError(f"{location}: {name!r} appears twice")
         unique.add(name)
 
 
-def require_usable_name(name: str, where: str) -> None:
+def require_usable_name(name: str, location: str) -> None:
     """Refuse a name that is empty, or too long for tables and file names."""
     if not 0 < len(name) <= LIMITS.name_text:
         raise DescriptionError(
-            f"{where}: found a name of {len(name)} characters, expected 1 to {LIMITS.name_text}"
+            f"{location}: found a name of {len(name)} characters, expected 1 to {LIMITS.name_text}"
         )
 
 
-def require_source(tags: str, sources: dict[str, str], where: str) -> None:
+def require_source(tags: str, sources: dict[str, str], location: str) -> None:
     """Refuse source tags (separated by spaces or commas) that are missing or unknown."""
     for tag in tags.replace(",", " ").split():
         if tag not in sources:
-            raise DescriptionError(f"{where}: unknown tag {tag!r}; sources: {', '.join(sources)}")
+            raise DescriptionError(
+                f"{location}: tag {tag!r} is unknown; expected one of: {', '.join(sources)}"
+            )
     if not tags.strip():
-        raise DescriptionError(f"{where}: is empty; expected the source of the numbers")
+        raise DescriptionError(f"{location}: is empty; expected the source of the numbers")
 
 
 HAND_PREFIX = "hand_"
@@ -120,7 +122,7 @@ class RobotPart:
 
     Attributes:
         name: Name of the part.
-        where: Prefix of its keys in messages: its file, "arm.yaml: ".
+        location: Prefix of its keys in messages: its file, "arm.yaml: ".
         root: Root link.
         joints: Joints, parents before children.
         actuators: Motors.
@@ -135,7 +137,7 @@ class RobotPart:
     """
 
     name: str
-    where: str
+    location: str
     root: str
     joints: list[Joint]
     actuators: list[Actuator]
@@ -350,19 +352,19 @@ def _joints(
     require_unique(names, f"{path}: joints")
     require_unique([root, *(entry.child for entry in entries)], f"{path}: joints: child links")
     for entry in entries:
-        where = f"{path}: joint {entry.name!r}"
+        location = f"{path}: joint {entry.name!r}"
         if entry.type not in JOINT_TYPES:
             raise DescriptionError(
-                f"{where}: type: found {entry.type!r}, expected one of {', '.join(JOINT_TYPES)}"
+                f"{location}: type: found {entry.type!r}, expected one of {', '.join(JOINT_TYPES)}"
             )
         low, high = entry.limits
         if not low <= high:
-            raise DescriptionError(f"{where}: limits: lower {low:.6g} is above upper {high:.6g}")
+            raise DescriptionError(f"{location}: limits: lower {low:.6g} is above upper {high:.6g}")
         if not np.linalg.norm(entry.axis) > 1e-9:
-            raise DescriptionError(f"{where}: axis: is zero, expected a direction")
-        require_source(entry.source, sources, f"{where}: source")
+            raise DescriptionError(f"{location}: axis: is zero, expected a direction")
+        require_source(entry.source, sources, f"{location}: source")
         if entry.coupling is not None:
-            entry.coupling.check(f"{where}: coupling")
+            entry.coupling.check(f"{location}: coupling")
     ordered = parents_first(entries, root)
     detached = next((entry for entry in entries if entry not in ordered), None)
     if detached is not None:
@@ -406,23 +408,26 @@ def _actuators(
         entries = {name: ActuatorEntry() for name, j in by_name.items() if j.coupling is None}
     actuators = []
     for name, entry in entries.items():
-        where = f"{path}: actuators.{name}"
+        location = f"{path}: actuators.{name}"
         joint = by_name.get(name)
         if joint is not None and joint.coupling is not None:
-            raise DescriptionError(f"{where}: joint {name!r} follows {joint.coupling.of!r} already")
+            raise DescriptionError(
+                f"{location}: joint {name!r} has a coupling to {joint.coupling.of!r}; "
+                "expected a joint without coupling"
+            )
         if entry.limits is None and joint is None:
-            raise DescriptionError(f"{where}: limits: missing (no joint has this name)")
+            raise DescriptionError(f"{location}: limits: missing (no joint has this name)")
         if entry.unit not in ("rad", "m"):
-            raise DescriptionError(f"{where}: unit: found {entry.unit!r}, expected 'rad' or 'm'")
+            raise DescriptionError(f"{location}: unit: found {entry.unit!r}, expected 'rad' or 'm'")
         low, high = entry.limits or ((joint.lower, joint.upper) if joint else (0.0, 0.0))
         if not low < high:
             raise DescriptionError(
-                f"{where}: limits: lower {low:.6g} is not below upper {high:.6g}"
+                f"{location}: limits: lower {low:.6g} is not below upper {high:.6g}"
             )
         velocity = entry.velocity or (joint.velocity if joint else math.inf)
         effort = entry.effort or (joint.effort if joint else math.inf)
         if entry.source or joint is None:
-            require_source(entry.source, sources, f"{where}: source")
+            require_source(entry.source, sources, f"{location}: source")
         unit = ("m" if joint.type == "prismatic" else "rad") if joint else entry.unit
         actuators.append(Actuator(name, unit, low, high, velocity, part, effort))
     check_couplings(by_name, actuators, path)

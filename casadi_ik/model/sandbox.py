@@ -1,9 +1,9 @@
-"""What reads somebody's macros and MJCF, run as a script: in a process of its own, with limits.
+"""Script that expands xacro and compiles MJCF files from untrusted sources, with limits.
 
-Standard library only, since it starts once for every file: `confined.py` runs it. The words behind
-it are what to do, the file, the limits (seconds of computing, bytes of memory and of output) and
-the file's arguments, NAME:=VALUE. It prints a line with notes as a JSON list, then what came out,
-and ends with 0; or prints a reason and ends with `REFUSED`.
+`urdf_mjcf.run_sandbox` starts a process for every file, so the module imports only the standard
+library at first. Arguments: task ("xacro" or "mujoco"), file, limits (CPU time [s], bytes of memory
+and of output) and the xacro arguments, NAME:=VALUE. The script writes a line of notes (JSON list)
+and the result, and exits with 0; or it writes the reason and exits with `REFUSED`.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 REFUSED = 3
-"""How the process ends if the file is refused."""
+"""Exit code if the file is refused."""
 
-PLAIN = (bool, int, float, str, list, tuple, dict, set, type(None))
-"""Values that an expression may hold."""
+VALUE_TYPES = (bool, int, float, str, list, tuple, dict, set, type(None))
+"""Types of values in expressions."""
 
 OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Add: operator.add,
@@ -43,25 +43,27 @@ OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.LtE: operator.le,
     ast.Gt: operator.gt,
     ast.GtE: operator.ge,
-    ast.In: lambda one, many: one in many,
-    ast.NotIn: lambda one, many: one not in many,
-    ast.Is: lambda one, other: one is other,
-    ast.IsNot: lambda one, other: one is not other,
+    ast.In: lambda item, container: item in container,
+    ast.NotIn: lambda item, container: item not in container,
+    ast.Is: operator.is_,
+    ast.IsNot: operator.is_not,
 }
+"""Operators of expressions, by node type."""
 
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     **{name: f for name, f in vars(math).items() if name[0] != "_" and callable(f)},
     **{f.__name__: f for f in (abs, all, any, bool, float, int, len, max, min, round, str, sum)},
     **{f.__name__: f for f in (dict, list, set, sorted, tuple)},
     "enumerate": lambda values: list(enumerate(values)),
-    "range": lambda *ends: list(range(*ends)),
+    "range": lambda *bounds: list(range(*bounds)),
     "zip": lambda *columns: list(zip(*columns, strict=False)),
 }
+"""Functions of expressions, by name."""
 
-TYPES = {kind.__name__: kind for kind in PLAIN[:-1]}
-"""Types that an expression may ask for by `isinstance`."""
+TYPES_BY_NAME = {kind.__name__: kind for kind in VALUE_TYPES[:-1]}
+"""Types that expressions may pass to `isinstance`."""
 
-METHODS: dict[type, tuple[str, ...]] = {
+CALLABLE_METHODS: dict[type, tuple[str, ...]] = {
     str: (
         *("startswith", "endswith", "lower", "upper", "title", "capitalize", "strip", "lstrip"),
         *("rstrip", "removeprefix", "removesuffix", "replace", "split", "rsplit", "partition"),
@@ -72,98 +74,100 @@ METHODS: dict[type, tuple[str, ...]] = {
     tuple: ("index", "count"),
     set: ("union", "intersection", "difference", "issubset", "issuperset"),
 }
-"""Methods that an expression may call, by the type of their object."""
+"""Methods that expressions may call, by the type of their object."""
 
-SCOPES = ("math", "python", "xacro")
-"""Before the name of a function."""
+NAMESPACES = ("math", "python", "xacro")
+"""Prefixes of function names, as in ``math.sin``."""
 
-FORBIDDEN = (
+FORBIDDEN_EVENTS = (
     *("exec", "import", "os.", "shutil.", "subprocess.", "socket.", "ctypes.", "pty.", "fcntl."),
     *("mmap.", "pickle.", "marshal.", "code.", "function.", "sqlite3.", "urllib.", "webbrowser."),
 )
-"""Beginnings of what Python reports before it does it, once macros are expanded."""
+"""Prefixes of the audit events that are refused during the expansion of macros."""
 
-NUMBERS = (
+ALLOWED_EVENTS = ("os.listdir", "os.scandir")
+"""Audit events that are allowed in spite of `FORBIDDEN_EVENTS`."""
+
+CHECKED_FIELDS = (
     *("body_pos", "body_quat", "jnt_pos", "jnt_axis", "qpos0", "eq_data", "wrap_prm", "mesh_vert"),
     *("geom_pos", "geom_quat", "geom_size"),
 )
-"""Of MuJoCo's model, those a robot is made of."""
+"""Fields of MuJoCo's model that become numbers of the robot."""
 
-LARGEST = 1e6
-"""None of them is larger."""
+MAX_FIELD_VALUE = 1e6
+"""Largest magnitude in `CHECKED_FIELDS`."""
 
-NOTES = 100
+MAX_NOTES = 100
 """Maximum number of notes."""
 
-UNKNOWN = "Caught an unknown exception"
-"""MuJoCo's words for having no memory."""
-
-HARMLESS = ("os.listdir", "os.scandir")
+OUT_OF_MEMORY_MESSAGE = "Caught an unknown exception"
+"""Start of MuJoCo's message when it runs out of memory."""
 
 
 class RefusedError(Exception):
-    """What a file asks for is not done."""
+    """The file is refused."""
 
 
-def evaluated(expression: str, names: Mapping[str, Any], more: Mapping[str, Any]) -> Any:
-    """The value of an expression of arithmetic, comparisons, texts, lists and mappings.
+def evaluate(expression: str, names: Mapping[str, Any], extra_functions: Mapping[str, Any]) -> Any:
+    """Evaluate an expression of arithmetic, comparisons, strings, lists and dictionaries.
 
     Args:
-        expression: What stands in the file.
+        expression: Python expression.
         names: Values by name.
-        more: Functions by name, beside `FUNCTIONS`.
+        extra_functions: Functions by name, in addition to `FUNCTIONS`.
 
     Raises:
-        RefusedError: It holds anything else.
+        RefusedError: The expression contains other syntax.
     """
-    functions = {**FUNCTIONS, **more}
+    functions = {**FUNCTIONS, **extra_functions}
     variables: dict[str, Any] = {}  # variables of comprehensions
+    source = expression.strip()
 
     def value(node: ast.AST) -> Any:
         match node:
             case ast.Expression(body=body):
                 return value(body)
-            case ast.Constant(value=found):
-                return plain(found, node)
+            case ast.Constant(value=constant):
+                return checked(constant, node)
             case ast.Name(id=name):
-                return plain(named(name), node)
+                return checked(look_up(name), node)
             case ast.UnaryOp(op=op, operand=operand) if type(op) in OPERATORS:
                 return OPERATORS[type(op)](value(operand))
             case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
                 return OPERATORS[type(op)](value(left), value(right))
             case ast.BoolOp(op=op, values=values):
-                found = None
-                for one in values:
-                    found = value(one)
-                    if bool(found) == isinstance(op, ast.Or):
+                result = None
+                for operand in values:
+                    result = value(operand)
+                    if bool(result) == isinstance(op, ast.Or):
                         break
-                return found
-            case ast.Compare(left=left, ops=ops, comparators=others):
-                found = value(left)
-                for op, other in zip(ops, others, strict=True):
-                    before, found = found, value(other)
-                    if not OPERATORS[type(op)](before, found):
+                return result
+            case ast.Compare(left=left, ops=ops, comparators=comparators):
+                previous = value(left)
+                for op, comparator in zip(ops, comparators, strict=True):
+                    current = value(comparator)
+                    if not OPERATORS[type(op)](previous, current):
                         return False
+                    previous = current
                 return True
             case ast.IfExp(test=test, body=body, orelse=orelse):
                 return value(body if value(test) else orelse)
             case ast.List(elts=elts):
-                return [value(one) for one in elts]
+                return [value(element) for element in elts]
             case ast.Tuple(elts=elts):
-                return tuple(value(one) for one in elts)
+                return tuple(value(element) for element in elts)
             case ast.Dict(keys=keys, values=values) if None not in keys:
                 return {value(k): value(v) for k, v in zip(keys, values, strict=True) if k}
-            case ast.Subscript(value=of, slice=ast.Slice(lower=low, upper=high, step=step)):
-                return value(of)[
-                    slice(*(None if x is None else value(x) for x in (low, high, step)))
-                ]
-            case ast.Subscript(value=of, slice=place):
-                return plain(value(of)[value(place)], node)
-            case ast.Attribute(value=of, attr=name):  # of a mapping, or of names with a scope
-                found = named(of.id) if isinstance(of, ast.Name) else value(of)
-                if not isinstance(found, dict):
+            case ast.Subscript(value=sequence, slice=ast.Slice(lower=low, upper=high, step=step)):
+                bounds = (None if x is None else value(x) for x in (low, high, step))
+                return value(sequence)[slice(*bounds)]
+            case ast.Subscript(value=container, slice=index):
+                return checked(value(container)[value(index)], node)
+            case ast.Attribute(value=owner, attr=name):  # a key of a dictionary or namespace
+                mapping = look_up(owner.id) if isinstance(owner, ast.Name) else value(owner)
+                if not isinstance(mapping, dict):
                     raise refused(node)
-                return plain(found[name], node)
+                return checked(mapping[name], node)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in functions:
                 return functions[name](*map(value, args))
             case ast.Call(func=ast.Name(id="dict"), args=[], keywords=pairs) if all(
@@ -171,37 +175,35 @@ def evaluated(expression: str, names: Mapping[str, Any], more: Mapping[str, Any]
             ):
                 return {pair.arg: value(pair.value) for pair in pairs}
             case ast.Call(
-                func=ast.Attribute(value=ast.Name(id=scope), attr=name), args=args, keywords=[]
-            ) if scope in SCOPES and name in functions:
+                func=ast.Attribute(value=ast.Name(id=prefix), attr=name), args=args, keywords=[]
+            ) if prefix in NAMESPACES and name in functions:
                 return functions[name](*map(value, args))
             case ast.Call(
                 func=ast.Name(id="isinstance")
                 | ast.Attribute(value=ast.Name(id="python"), attr="isinstance"),
-                args=[of, ast.Name(id=kind)],
+                args=[argument, ast.Name(id=kind)],
                 keywords=[],
-            ) if kind in TYPES:
-                return isinstance(value(of), TYPES[kind])
-            case ast.Call(func=ast.Attribute(value=of, attr=name), args=args, keywords=[]):
-                owner = value(of)
-                methods = [names for kind, names in METHODS.items() if isinstance(owner, kind)]
-                if not methods or name not in methods[0]:
+            ) if kind in TYPES_BY_NAME:
+                return isinstance(value(argument), TYPES_BY_NAME[kind])
+            case ast.Call(func=ast.Attribute(value=owner, attr=name), args=args, keywords=[]):
+                instance = value(owner)
+                kinds = [kind for kind in CALLABLE_METHODS if isinstance(instance, kind)]
+                if not kinds or name not in CALLABLE_METHODS[kinds[0]]:
                     raise refused(node)
-                kind = next(kind for kind in METHODS if isinstance(owner, kind))
-                result = getattr(kind, name)(owner, *map(value, args))
-                return list(result) if kind is dict and name != "get" else result
+                result = getattr(kinds[0], name)(instance, *map(value, args))
+                return list(result) if kinds[0] is dict and name != "get" else result
             case (
-                ast.ListComp(elt=elt, generators=[ast.comprehension(target, of, tests)])
-                | ast.GeneratorExp(elt=elt, generators=[ast.comprehension(target, of, tests)])
+                ast.ListComp(elt=elt, generators=[ast.comprehension(target, iterable, tests)])
+                | ast.GeneratorExp(elt=elt, generators=[ast.comprehension(target, iterable, tests)])
             ):
-                several = isinstance(target, ast.Tuple)
                 targets = target.elts if isinstance(target, ast.Tuple) else [target]
                 results = []
-                for item in value(of):
-                    items = item if several else (item,)
-                    for place, part in zip(targets, items, strict=True):
-                        if not isinstance(place, ast.Name):
+                for item in value(iterable):
+                    items = item if isinstance(target, ast.Tuple) else (item,)
+                    for variable, part in zip(targets, items, strict=True):
+                        if not isinstance(variable, ast.Name):
                             raise refused(node)
-                        variables[place.id] = part
+                        variables[variable.id] = part
                     if all(value(test) for test in tests):
                         results.append(value(elt))
                 return results
@@ -210,7 +212,7 @@ def evaluated(expression: str, names: Mapping[str, Any], more: Mapping[str, Any]
             case _:
                 raise refused(node)
 
-    def named(name: str) -> Any:
+    def look_up(name: str) -> Any:
         if name in variables:
             return variables[name]
         try:
@@ -218,42 +220,46 @@ def evaluated(expression: str, names: Mapping[str, Any], more: Mapping[str, Any]
         except KeyError:
             raise RefusedError(f"name {name!r} is not defined") from None
 
-    def plain(found: Any, node: ast.AST) -> Any:
-        if not isinstance(found, PLAIN):
+    def checked(result: Any, node: ast.AST) -> Any:
+        if not isinstance(result, VALUE_TYPES):
             raise refused(node)
-        return found
+        return result
 
     def refused(node: ast.AST) -> RefusedError:
-        text = ast.get_source_segment(text_, node) or expression
+        text = ast.get_source_segment(source, node) or expression
         return RefusedError(
             f"{text!r} is not evaluated; expected arithmetic, comparisons, functions of numbers, "
-            "and methods of texts and lists"
+            "and methods of strings and lists"
         )
 
-    text_ = expression.strip()
-    return value(ast.parse(text_, mode="eval"))
+    return value(ast.parse(source, mode="eval"))
 
 
 def package_folders(name: str, file: Path) -> tuple[list[Path], list[Path]]:
-    """Folders that may be a ROS package.
+    """Return folders that may be a ROS package.
 
     Args:
-        name: The package's.
-        file: The file that names it.
+        name: Name of the package.
+        file: File that refers to the package.
 
     Returns:
-        Those above the file, or beside what is above it; and those that the environment leads to
+        Folders above the file or next to these, and folders that the environment states
         (ROS_PACKAGE_PATH, and ``share`` of AMENT_PREFIX_PATH).
     """
 
-    def listed(variable: str) -> list[Path]:
-        return [Path(one) for one in os.environ.get(variable, "").split(os.pathsep) if one]
+    def folders_of(variable: str) -> list[Path]:
+        return [Path(part) for part in os.environ.get(variable, "").split(os.pathsep) if part]
 
-    above, told = file.resolve().parents, listed("ROS_PACKAGE_PATH")
-    near = [one / name for one in above] + [one for one in above if _is_package(one, name)]
-    known = [one / name for one in told] + [one for one in told if one.name == name]
-    known += [one / "share" / name for one in listed("AMENT_PREFIX_PATH")]
-    return [one for one in near if one.is_dir()], [one for one in known if one.is_dir()]
+    above, ros_folders = file.resolve().parents, folders_of("ROS_PACKAGE_PATH")
+    nearby = [folder / name for folder in above]
+    nearby += [folder for folder in above if _is_package(folder, name)]
+    in_environment = [folder / name for folder in ros_folders]
+    in_environment += [folder for folder in ros_folders if folder.name == name]
+    in_environment += [folder / "share" / name for folder in folders_of("AMENT_PREFIX_PATH")]
+    return (
+        [folder for folder in nearby if folder.is_dir()],
+        [folder for folder in in_environment if folder.is_dir()],
+    )
 
 
 def _is_package(folder: Path, name: str) -> bool:
@@ -261,31 +267,31 @@ def _is_package(folder: Path, name: str) -> bool:
     if folder.name == name:
         return True
     with contextlib.suppress(OSError, UnicodeDecodeError):
-        text = (folder / "package.xml").read_text(encoding="utf-8")[:MANIFEST]
+        text = (folder / "package.xml").read_text(encoding="utf-8")[:MAX_MANIFEST_LENGTH]
         return re.search(rf"<name>\s*{re.escape(name)}\s*</name>", text) is not None
     return False
 
 
-MANIFEST = 100_000
-"""Maximum number of characters of a package.xml in which the package's name is looked up."""
+MAX_MANIFEST_LENGTH = 100_000
+"""Number of characters of a package.xml that are searched for the name of the package."""
 
 
 def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> str:
     """Return the text of a file with its macros expanded.
 
-    It reads files below its folder and those of packages it finds, and nothing else; expressions
-    are `evaluated`, no code of the file runs. Parameters that a macro does not declare are ignored:
-    files of makers pass such to newer versions of their macros.
+    The file can read files in its folder and in the packages that it refers to. `evaluate` computes
+    its expressions; no code of the file is executed. Undeclared parameters of macros are ignored,
+    because files of manufacturers pass parameters of newer versions of their macros.
 
     Args:
-        path: The file.
+        path: xacro file.
         arguments: Values of the file's arguments by name.
-        notes: List to which is added what was ignored.
+        notes: List to which a note is added for each ignored parameter.
 
     Raises:
-        RefusedError: It asks for more.
+        RefusedError: The file reads other files, or contains expressions that are not evaluated.
     """
-    import xml.dom.expatbuilder  # noqa: F401  # now: nothing can be imported later
+    import xml.dom.expatbuilder  # noqa: F401  # imports are refused later
 
     import xacro
     import yaml  # noqa: F401
@@ -293,33 +299,35 @@ def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> 
 
     library: Any = xacro
     folders = [path.resolve().parent]
-    for one in path.resolve().parents:
-        if (one / "package.xml").is_file():
-            folders.append(one)
+    for folder in path.resolve().parents:
+        if (folder / "package.xml").is_file():
+            folders.append(folder)
             break
 
     def find(name: str) -> str:
-        near, known = package_folders(name, path)
-        # A folder of that name alone is none: it may be anybody's.
-        near = [x for x in near if (x / "package.xml").is_file() or x in path.resolve().parents]
-        if not near + known:
+        nearby, in_environment = package_folders(name, path)
+        # A neighbouring folder that only has the name may be unrelated to the file.
+        above = path.resolve().parents
+        nearby = [x for x in nearby if (x / "package.xml").is_file() or x in above]
+        candidates = nearby + in_environment
+        if not candidates:
             raise RefusedError(
-                f"package {name!r} is not found: name the folder that holds it in the environment, "
-                "ROS_PACKAGE_PATH=FOLDER casadi-ik import ..."
+                f"package {name!r} is not found; state the folder that contains it in the "
+                "environment: ROS_PACKAGE_PATH=FOLDER casadi-ik import ..."
             )
-        folders.append((near + known)[0].resolve())
+        folders.append(candidates[0].resolve())
         return str(folders[-1])
 
     def argument(name: str, args: Mapping[str, Any] | None = None) -> Any:
-        known = library.substitution_args_context["arg"] if args is None else args
-        if name not in known and name == "name":
+        values = library.substitution_args_context["arg"] if args is None else args
+        if name not in values and name == "name":
             return path.name.partition(".")[0]
-        if name not in known:
+        if name not in values:
             raise RefusedError(
                 f"argument {name!r} has no default; write --xacro-args {name}:=VALUE, or "
                 f"xacro: [{name}:=VALUE] in a description"
             )
-        return known[name]
+        return values[name]
 
     call_macro = library.handle_macro_call
 
@@ -330,23 +338,23 @@ def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> 
                 for name in [name for name, _ in node.attributes.items()]:
                     if name not in macro.params:
                         node.removeAttribute(name)
-                        notes.append(f"{node.tagName}: parameter {name!r} is not declared: ignored")
+                        notes.append(f"{node.tagName}: undeclared parameter {name!r} is ignored")
         return call_macro(node, macros, symbols)
 
     def extension(text: str, context: Mapping[str, Any]) -> str:
         values = {k: substitution_args.convert_value(v, "auto") for k, v in context["arg"].items()}
-        known = {"pi": math.pi, "true": True, "false": False, **values}
-        return str(evaluated(text, known, {"arg": argument, "find": find}))
+        names = {"pi": math.pi, "true": True, "false": False, **values}
+        return str(evaluate(text, names, {"arg": argument, "find": find}))
 
     def variable(name: str) -> str:
-        raise RefusedError(f"$(env {name}) is not read, expected no variables of the environment")
+        raise RefusedError(f"$(env {name}): environment variables are not read; expected none")
 
-    more = {"load_yaml": library.load_yaml, "arg": argument}
+    xacro_functions = {"load_yaml": library.load_yaml, "arg": argument}
 
     def expression(text: str, names: Mapping[str, Any], *_: Any) -> Any:
-        return evaluated(text, names, more)
+        return evaluate(text, names, xacro_functions)
 
-    ours = {
+    replacements = {
         (library, "safe_eval"): expression,
         (library, "handle_macro_call"): call,
         (substitution_args, "_eval"): extension,
@@ -355,7 +363,7 @@ def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> 
         (substitution_args, "_eval_optenv"): lambda _, default="": default,
         (substitution_args, "_eval_find"): find,
     }
-    for (module, name), function in ours.items():
+    for (module, name), function in replacements.items():
         if not hasattr(module, name):
             raise RefusedError(
                 f"the installed xacro has no {module.__name__}.{name}; pip install 'xacro>=2.1,<3'"
@@ -366,16 +374,16 @@ def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> 
         if event == "open":
             file, _, flags = arguments
             reads = isinstance(file, str) and not flags & (os.O_WRONLY | os.O_RDWR)
-            place = Path(file).resolve() if reads else None
-            if place is None or not (below(place) or place in manifests):
-                raise RefusedError(f"reads {str(file)!r}, expected a file below {folders[0]}")
-        elif event.startswith(FORBIDDEN) and event not in HARMLESS:
-            raise RefusedError(f"asks for {event} {arguments[:1]}, expected macros alone")
+            target = Path(file).resolve() if reads else None
+            if target is None or not (in_folders(target) or target in manifests):
+                raise RefusedError(f"reads {str(file)!r}; expected a file below {folders[0]}")
+        elif event.startswith(FORBIDDEN_EVENTS) and event not in ALLOWED_EVENTS:
+            raise RefusedError(f"requests {event} {arguments[:1]}; expected only macros")
 
     manifests = {folder / "package.xml" for folder in path.resolve().parents}
 
-    def below(place: Path) -> bool:
-        return any(place.is_relative_to(folder) for folder in folders)
+    def in_folders(target: Path) -> bool:
+        return any(target.is_relative_to(folder) for folder in folders)
 
     sys.addaudithook(watch)
     document: Any = library.process_file(str(path), mappings=dict(arguments))
@@ -383,20 +391,20 @@ def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> 
 
 
 def _compiled(library: Any, path: Path, notes: list[str]) -> Any:
-    """Return MuJoCo's model of a file, without the meshes and pictures that cannot be read.
+    """Return MuJoCo's model of a file; meshes and textures that cannot be read are omitted.
 
     Raises:
-        ValueError: MuJoCo cannot read it.
+        ValueError: MuJoCo cannot read the file.
     """
     try:
         return library.MjModel.from_xml_path(str(path))
     except ValueError as error:
         text = str(error)
-        if text.startswith(UNKNOWN):
+        if text.startswith(OUT_OF_MEMORY_MESSAGE):
             raise
-    left_out: set[str] = set()
+    omitted: set[str] = set()
     while True:
-        spec = _without(library, path, left_out)
+        spec = _spec(library, path, omitted)
         try:
             return spec.compile()
         except ValueError as error:
@@ -404,13 +412,13 @@ def _compiled(library: Any, path: Path, notes: list[str]) -> Any:
         broken = {_mesh_name(mesh) for mesh in spec.meshes if _names_mesh(text, mesh)}
         if not broken:
             raise ValueError(text)
-        left_out |= broken
+        omitted |= broken
         reason = " ".join(text.split()).replace(str(path.parent) + os.sep, "")
-        notes += [f"mesh {name!r} is left out: {reason}" for name in sorted(broken)]
+        notes += [f"mesh {name!r} is omitted: {reason}" for name in sorted(broken)]
 
 
-def _without(library: Any, path: Path, left_out: Collection[str]) -> Any:
-    """Return what a file describes, without pictures, masses and some meshes."""
+def _spec(library: Any, path: Path, omitted_meshes: Collection[str]) -> Any:
+    """Return the specification of a file without textures, skins, masses and some meshes."""
     spec = library.MjSpec.from_file(str(path))
     spec.compiler.boundmass, spec.compiler.boundinertia = BOUND_MASS, BOUND_INERTIA
     for material in spec.materials:
@@ -418,14 +426,14 @@ def _without(library: Any, path: Path, left_out: Collection[str]) -> Any:
     for item in [*spec.textures, *spec.skins]:
         spec.delete(item)
     for geom in spec.geoms:
-        if geom.meshname in left_out:
+        if geom.meshname in omitted_meshes:
             geom.meshname, geom.type = "", library.mjtGeom.mjGEOM_SPHERE
-            geom.size = [TINY, 0, 0]
+            geom.size = [OMITTED_MESH_RADIUS, 0, 0]
             geom.contype = geom.conaffinity = 0
     for mesh in spec.meshes:
-        if _mesh_name(mesh) in left_out:
+        if _mesh_name(mesh) in omitted_meshes:
             spec.delete(mesh)
-        else:  # masses are not needed, and those of thin meshes are refused
+        else:  # MuJoCo refuses the volume of thin meshes, and masses are not used
             mesh.inertia = library.mjtMeshInertia.mjMESH_INERTIA_SHELL
     return spec
 
@@ -443,54 +451,58 @@ def _names_mesh(message: str, mesh: Any) -> bool:
 
 
 BOUND_MASS, BOUND_INERTIA = 1e-3, 1e-6
-"""Least mass [kg] and inertia [kg m^2] of bodies whose shapes are left out."""
+"""Minimum mass [kg] and inertia [kg m^2] of bodies, whose shapes may be omitted."""
 
-TINY = 1e-5
-"""Radius of a ball in the place of a mesh that is left out [m]; it is no shape of the link."""
+OMITTED_MESH_RADIUS = 1e-5
+"""Radius of the ball that replaces an omitted mesh [m]; it does not become a shape of the link."""
 
 
 def compile_mjcf(path: Path, notes: list[str]) -> bytes:
-    """Return MuJoCo's model of a file, as MuJoCo saves one.
+    """Return MuJoCo's model of a file in its binary format.
 
     Args:
-        path: The file.
-        notes: List to which is added what was left out.
+        path: MJCF file.
+        notes: List to which a note is added for each omitted mesh.
 
     Raises:
-        ValueError: MuJoCo cannot read it, or it has numbers that no robot has.
+        ValueError: MuJoCo cannot read the file.
+        RefusedError: A number of the model is not finite or too large.
     """
     import mujoco
     import numpy as np
 
     library: Any = mujoco
     model = _compiled(library, path, notes)
-    for name in NUMBERS:
-        if not (np.abs(getattr(model, name)) <= LARGEST).all():
-            raise RefusedError(f"{name}: expected finite numbers up to {LARGEST:g}")
+    for name in CHECKED_FIELDS:
+        if not (np.abs(getattr(model, name)) <= MAX_FIELD_VALUE).all():
+            raise RefusedError(
+                f"{name}: a number is not finite or too large; expected at most {MAX_FIELD_VALUE:g}"
+            )
     if np.isnan(model.jnt_range).any():
-        raise RefusedError("jnt_range: holds NaN, expected numbers")
+        raise RefusedError("jnt_range: a limit is NaN; expected numbers")
     if (np.abs(np.linalg.norm(model.jnt_axis, axis=1) - 1) > 1e-6).any():
-        raise RefusedError("jnt_axis: one is no direction")
-    found = np.empty(library.mj_sizeModel(model), np.uint8)
-    library.mj_saveModel(model, None, found)
-    return found.tobytes()
+        raise RefusedError("jnt_axis: an axis is not a direction; expected a vector of length > 0")
+    model_data = np.empty(library.mj_sizeModel(model), np.uint8)
+    library.mj_saveModel(model, None, model_data)
+    return model_data.tobytes()
 
 
-def _limited(seconds: int, memory: int) -> None:
+def _set_limits(seconds: int, memory: int) -> None:
+    """Limit CPU time [s] and memory [bytes] of this process, and forbid it to write files."""
     try:
         import resource
-    except ImportError:  # Windows: time alone is limited, from outside
+    except ImportError:  # On Windows only the parent process limits the time.
         return
     limits = {"CPU": seconds, "AS": memory, "CORE": 0, "FSIZE": 0}
-    for what, most in limits.items():
+    for name, limit in limits.items():
         try:
-            resource.setrlimit(getattr(resource, f"RLIMIT_{what}"), (most, most))
-        except (OSError, ValueError, AttributeError):  # not where it is not known
+            resource.setrlimit(getattr(resource, f"RLIMIT_{name}"), (limit, limit))
+        except (OSError, ValueError, AttributeError):  # the platform does not have this limit
             continue
 
 
-def reason(error: BaseException) -> str:
-    """Return why a file is refused: the message of `RefusedError` if a library has wrapped one."""
+def refusal_reason(error: BaseException) -> str:
+    """Return why a file is refused: the message of a wrapped `RefusedError` if there is one."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, RefusedError):
         cause = getattr(cause, "exc", None) or cause.__cause__ or cause.__context__
@@ -505,35 +517,35 @@ def reason(error: BaseException) -> str:
 
 
 def main(words: list[str]) -> int:
-    """Do what the words say; see the module."""
-    what, path, (seconds, memory, most) = words[0], Path(words[1]), map(int, words[2:5])
+    """Run the script with its command-line arguments; return the exit code."""
+    task, path, (seconds, memory, max_size) = words[0], Path(words[1]), map(int, words[2:5])
     pairs = (word.partition(":=") for word in words[5:])
     arguments = {name: value for name, _, value in pairs}
-    _limited(seconds, memory)
-    # What libraries say goes nowhere: behind the answer nothing may stand.
-    answer = os.fdopen(os.dup(1), "wb")
+    _set_limits(seconds, memory)
+    # Output of libraries is discarded, so that it cannot mix with the result.
+    result_stream = os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     code, notes = 0, list[str]()
     try:
-        found = (
+        output = (
             expand_xacro(path, arguments, notes).encode()
-            if what == "xacro"
+            if task == "xacro"
             else compile_mjcf(path, notes)
         )
-        if len(found) > most:
-            text = f"it becomes {len(found) >> 20} MiB, expected at most {most >> 20}"
-            code, found = REFUSED, text.encode()
+        if len(output) > max_size:
+            text = f"expands to {len(output) >> 20} MiB; expected at most {max_size >> 20}"
+            code, output = REFUSED, text.encode()
         if not code:
-            found = json.dumps(notes[:NOTES]).encode() + b"\n" + found
+            output = json.dumps(notes[:MAX_NOTES]).encode() + b"\n" + output
     except MemoryError:
         return 1
     except BaseException as error:
-        text = reason(error)
-        if text.startswith(UNKNOWN):
+        text = refusal_reason(error)
+        if text.startswith(OUT_OF_MEMORY_MESSAGE):
             return 1
-        code, found = REFUSED, text[:4000].encode(errors="replace")
-    answer.write(found)
-    answer.flush()
+        code, output = REFUSED, text[:4000].encode(errors="replace")
+    result_stream.write(output)
+    result_stream.flush()
     return code
 
 

@@ -414,22 +414,24 @@ class MeshShape(Body):
         return distance, normal
 
 
-def load_mesh_shape(files: Sequence[Path], scale: float, where: str) -> MeshShape:
+def load_mesh_shape(files: Sequence[Path], scale: float, location: str) -> MeshShape:
     """The body that meshes make together.
 
     Args:
         files: Of meshes; what hangs together in a file is a piece.
         scale: By what factor it is larger than they say.
-        where: File and key that name them, for messages.
+        location: File and key that name them, for messages.
 
     Raises:
         DescriptionError: A file is missing, no mesh, or has too many pieces.
     """
     pieces, notes = list[Mesh](), list[str]()
     for file in files:
-        points, triangles = read_body(file, where)
+        points, triangles = read_body(file, location)
         points = scale * points
-        warn_of_large_mesh(points, where if str(file) in where else f"{where}: {file.name}")
+        warn_of_large_mesh(
+            points, location if str(file) in location else f"{location}: {file.name}"
+        )
         points, single = single_sided(points, triangles)
         if len(single) < len(triangles):
             notes.append(f"{len(triangles) - len(single):,} triangles were there twice: used once")
@@ -437,7 +439,7 @@ def load_mesh_shape(files: Sequence[Path], scale: float, where: str) -> MeshShap
     if len(pieces) > scaled_limit(LIMITS.object_pieces):
         hint = raise_hint(len(pieces), LIMITS.object_pieces)
         most = f"at most {scaled_limit(LIMITS.object_pieces)} {hint}"
-        raise DescriptionError(f"{where}: found {len(pieces)} pieces, expected {most}")
+        raise DescriptionError(f"{location}: found {len(pieces)} pieces, expected {most}")
     return MeshShape(tuple(pieces), tuple(notes))
 
 

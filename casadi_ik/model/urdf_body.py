@@ -21,21 +21,21 @@ BODY_FORMATS = (*MESH_FORMATS, ".urdf")
 Triangles = tuple[Array, NDArray[np.int64]]
 
 
-def read_body(path: Path, where: str) -> Triangles:
+def read_body(path: Path, location: str) -> Triangles:
     """Return the vertices (k, 3) and triangles (t, 3) of a mesh file or a URDF.
 
     Args:
         path: A mesh, or a URDF whose visual geometry is read, or its collision geometry if it has
             no visual one. Movable joints are at zero; the frame is that of the root link.
-        where: File and key that name it, for messages.
+        location: File and key that name it, for messages.
 
     Raises:
         DescriptionError: The file does not exist, is damaged, or has no geometry.
     """
     if path.suffix.lower() != ".urdf":
-        return read_mesh(path, where)
+        return read_mesh(path, location)
     if not path.is_file():
-        raise DescriptionError(f"{where}: no such file {str(path)!r}")
+        raise DescriptionError(f"{location}: no such file {str(path)!r}")
     root = parse_xml(read_robot_file(path), path)
     if root.tag != "robot":
         raise DescriptionError(f"{path}: found <{root.tag}>, expected a URDF with <robot>")

@@ -46,17 +46,20 @@ from casadi_ik.model.xml_tree import (
 )
 
 XACRO_READER = "xacro"
+"""Name of the package that expands macros."""
+
 MJCF_READER = "mujoco"
+"""Name of the package that reads MJCF."""
 
 
 def run_sandbox(
     reader: str, path: Path, arguments: Sequence[str] = ()
 ) -> tuple[bytes, tuple[str, ...]]:
-    """Return what the sandbox makes of a file, and its notes.
+    """Return the output of the sandbox for a file, and its notes.
 
     Args:
         reader: `XACRO_READER` (text with expanded macros) or `MJCF_READER` (MuJoCo's saved model).
-        path: The file.
+        path: xacro or MJCF file.
         arguments: Values of the file's arguments, NAME:=VALUE.
 
     Raises:
@@ -66,47 +69,42 @@ def run_sandbox(
     if find_spec(reader) is None:
         noun = "has xacro macros" if reader == XACRO_READER else "is MJCF"
         raise MissingExtraError(f"{path}: {noun}; to read it: {install_command(reader)}")
-    seconds, doing = (
-        scaled_limit(LIMITS.reader_seconds),
-        "expand" if reader == XACRO_READER else "read",
-    )
+    verb = "expand" if reader == XACRO_READER else "read"
+    seconds = scaled_limit(LIMITS.reader_seconds)
     limits = (seconds, scaled_limit(LIMITS.reader_memory), scaled_limit(LIMITS.reader_output))
     # -P excludes the script's folder, whose modules have the names of other packages' modules.
-    script, place = Path(sandbox.__file__).resolve(), path.resolve()
-    command = [sys.executable, "-P", str(script), reader, str(place), *map(str, limits), *arguments]
-    known = os.pathsep.join(str(Path(one).resolve()) for one in sys.path)
+    script, file = str(Path(sandbox.__file__).resolve()), str(path.resolve())
+    command = [sys.executable, "-P", script, reader, file, *map(str, limits), *arguments]
+    python_path = os.pathsep.join(str(Path(folder).resolve()) for folder in sys.path)
     try:
-        with tempfile.TemporaryDirectory() as folder:  # MuJoCo keeps a log where it runs
-            done = subprocess.run(
+        with tempfile.TemporaryDirectory() as folder:  # MuJoCo writes a log to its working folder
+            process = subprocess.run(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 cwd=folder,
-                env=os.environ | {"PYTHONPATH": known},
+                env=os.environ | {"PYTHONPATH": python_path},
                 timeout=LIMITS.reader_patience * seconds,
                 check=False,
             )
     except subprocess.TimeoutExpired:
         code, output = 1, b""
     except (OSError, ValueError) as error:
-        raise DescriptionError(
-            f"{path}: the process that reads it cannot start: {error}"
-        ) from error
+        raise DescriptionError(f"{path}: the reader process cannot start: {error}") from error
     else:
-        code, output = done.returncode, done.stdout
+        code, output = process.returncode, process.stdout
     if code == 0:
         notes, _, content = output.partition(b"\n")
         return content, tuple(f"{path.name}: {note}" for note in json.loads(notes))
     reason = f"takes more than {seconds} s of computing or {limits[1] >> 20} MiB {RAISE_HINT}"
     if code == sandbox.REFUSED:
         reason = " ".join(output.decode(errors="replace").split())
-    raise DescriptionError(f"{path}: {reader} cannot {doing} it: {reason}")
+    raise DescriptionError(f"{path}: {reader} cannot {verb} it: {reason}")
 
 
 WORLD = "world"
 """MuJoCo's name of the fixed world."""
-
 
 SAVED_MODEL = "model.mjb"
 """Virtual file name under which a saved model is passed to MuJoCo."""
@@ -130,10 +128,10 @@ def mujoco_model(path: Path) -> tuple[Any, Any, tuple[str, ...]]:
 def read_mjcf(path: Path) -> RobotTree:
     """Read an MJCF file.
 
-    A body of several joints becomes as many links, named BODY:JOINT except for the last. A joint
-    equality becomes a polynomial coupling. The joints of a fixed tendon with an actuator follow a
-    motor with the tendon's name, whose position is the tendon's length; each joint moves through
-    its range in proportion.
+    A body with several joints becomes one link per joint, named BODY:JOINT except for the last. A
+    joint equality becomes a polynomial coupling. The joints of a fixed tendon with an actuator
+    follow a motor with the tendon's name, whose position is the length of the tendon; the positions
+    of the joints in their ranges are proportional to it.
 
     Raises:
         DescriptionError: See `mujoco_model`; or a part of the model is not supported.
@@ -166,7 +164,7 @@ def joint_name(model: Any, joint: int) -> str:
 def _body_joints(
     mujoco: Any, model: Any, body: int, names: list[str], couplings: dict[str, Coupling]
 ) -> list[TreeJoint]:
-    """Return the joints of a body in order, or its fixed joint."""
+    """Return the joints between a body and its parent in order, or the fixed joint."""
     placement = mjcf_pose(mujoco, model.body_pos[body], model.body_quat[body])
     parent = names[model.body_parentid[body]]
     first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
@@ -191,7 +189,7 @@ def _body_joints(
             kind = "continuous"
         zero = float(model.qpos0[model.jnt_qposadr[joint]])
         if kind in ("revolute", "continuous"):
-            # The joint rotates about the anchor; a link in between has its frame there.
+            # The joint rotates about the anchor; an intermediate link has its frame there.
             pose = placement @ anchor @ joint_motion("revolute", axis, -zero)
             offset: Array = np.asarray(np.linalg.inv(anchor), dtype=np.float64)
         else:
@@ -238,7 +236,7 @@ def _equalities(mujoco: Any, model: Any, path: Path) -> dict[str, Coupling]:
         terms = [float(value) for value in model.eq_data[i, :5]]
         if leader < 0:
             raise DescriptionError(
-                f"{path}: joint {name!r}: an equality holds it at {terms[0]:.6g}; write "
+                f"{path}: joint {name!r}: an equality fixes it at {terms[0]:.6g}; write "
                 f"locked: {{{name}: {terms[0]:.6g}}}"
             )
         # MuJoCo's polynomial is in displacements from the initial positions.
@@ -308,8 +306,8 @@ def read_urdf(element: Element, path: Path) -> RobotTree:
     """Read a URDF.
 
     Args:
-        element: Its ``robot`` element.
-        path: The file.
+        element: The ``robot`` element.
+        path: URDF file, for error messages.
 
     Raises:
         DescriptionError: The file is not a tree, or is invalid; the message names file and joint.
@@ -327,7 +325,9 @@ def read_urdf(element: Element, path: Path) -> RobotTree:
         _check_joint(joint, links, f"{path}: joint {name!r}")
     root = _root(links, joints, path)
     if not joints:
-        raise DescriptionError(f"{path}: has no joints ({len(links)} links)")
+        raise DescriptionError(
+            f"{path}: file has no joints ({len(links)} links); expected at least one"
+        )
     tree_joints = [_joint(item, name, f"{path}: joint {name!r}") for name, item in joints.items()]
     ordered = parents_first(tree_joints, root)
     return RobotTree(path, root, ordered, shapes=urdf_shapes(element), element=element)
@@ -336,33 +336,35 @@ def read_urdf(element: Element, path: Path) -> RobotTree:
 def _check_unique(names: list[str], noun: str, path: Path) -> None:
     for name, count in Counter(names).items():
         if count > 1:
-            raise DescriptionError(f"{path}: {noun} {name!r} appears twice")
+            raise DescriptionError(f"{path}: {noun} {name!r} appears twice; expected unique names")
 
 
-def _check_joint(joint: Element, links: list[str], where: str) -> None:
-    """Check everything about a joint for which pinocchio would raise an unspecific error."""
+def _check_joint(joint: Element, links: list[str], location: str) -> None:
+    """Check the elements of a joint for which pinocchio would raise an unspecific error."""
     kind = joint.get("type")
     if kind not in URDF_JOINT_TYPES:
         raise DescriptionError(
-            f"{where}: type: found {kind!r}, expected one of {', '.join(URDF_JOINT_TYPES)}"
+            f"{location}: type: found {kind!r}, expected one of {', '.join(URDF_JOINT_TYPES)}"
         )
     for end in ("parent", "child"):
-        link = required_attribute(joint.find(end), "link", f"{where}: {end}")
+        link = required_attribute(joint.find(end), "link", f"{location}: {end}")
         if link not in links:
-            raise DescriptionError(f"{where}: {end}: link {link!r} does not exist")
+            raise DescriptionError(
+                f"{location}: {end}: link {link!r} does not exist; expected a link of the file"
+            )
     for name in ("xyz", "rpy"):
-        check_vector(joint.find("origin"), name, f"{where}: origin")
+        check_vector(joint.find("origin"), name, f"{location}: origin")
     axis = joint.find("axis")
-    check_vector(axis, "xyz", f"{where}: axis")
+    check_vector(axis, "xyz", f"{location}: axis")
     if kind not in ("fixed", "floating") and not np.linalg.norm(_direction(axis)) > 1e-9:
-        raise DescriptionError(f"{where}: axis: is zero, expected a direction")
+        raise DescriptionError(f"{location}: axis: is zero; expected a direction")
     limit_element = joint.find("limit")
-    limits = _stated_limits(limit_element, where)
+    limits = _stated_limits(limit_element, location)
     for rate in ("velocity", "effort"):
-        finite_number(limit_element, rate, f"{where}: limit", math.inf)
+        finite_number(limit_element, rate, f"{location}: limit", math.inf)
     low, high = (limit or 0.0 for limit in limits)
     if low > high:
-        raise DescriptionError(f"{where}: limit: lower {low:.6g} is above upper {high:.6g}")
+        raise DescriptionError(f"{location}: limit: lower {low:.6g} is above upper {high:.6g}")
 
 
 def _root(links: list[str], joints: dict[str, Element], path: Path) -> str:
@@ -380,8 +382,8 @@ def _root(links: list[str], joints: dict[str, Element], path: Path) -> str:
         raise DescriptionError(f"{path}: the base link is missing{cycle}; expected a tree")
     if len(roots) > 1:
         raise DescriptionError(
-            f"{path}: found several base links ({', '.join(roots)}), expected one: join them by a "
-            "fixed joint"
+            f"{path}: several base links ({', '.join(roots)}); expected one: join them by a fixed "
+            "joint"
         )
     for link in links:
         visited = set()
@@ -393,31 +395,28 @@ def _root(links: list[str], joints: dict[str, Element], path: Path) -> str:
     return roots[0]
 
 
-def _joint(element: Element, name: str, where: str) -> TreeJoint:
-    kind, axis, limit_element = (
-        element.get("type", ""),
-        np.array([0.0, 0.0, 1.0]),
-        element.find("limit"),
-    )
+def _joint(element: Element, name: str, location: str) -> TreeJoint:
+    kind, limit_element = element.get("type", ""), element.find("limit")
+    axis = np.array([0.0, 0.0, 1.0])
     if kind in ("revolute", "continuous", "prismatic"):
         axis = np.array(_direction(element.find("axis")))
         axis /= np.linalg.norm(axis)
     velocity, effort = (
-        abs(finite_number(limit_element, rate, f"{where}: limit", math.inf) or math.inf)
+        abs(finite_number(limit_element, rate, f"{location}: limit", math.inf) or math.inf)
         for rate in ("velocity", "effort")
     )
     placement = origin_pose(element)
     assert placement is not None  # _check_joint has checked its vectors
     return TreeJoint(
         name,
-        required_attribute(element.find("parent"), "link", where),
-        required_attribute(element.find("child"), "link", where),
+        required_attribute(element.find("parent"), "link", location),
+        required_attribute(element.find("child"), "link", location),
         kind,
         placement,
         axis,
-        _limits(limit_element, where) if kind in ("revolute", "prismatic") else None,
+        _limits(limit_element, location) if kind in ("revolute", "prismatic") else None,
         velocity,
-        _mimic(element, where),
+        _mimic(element, location),
         effort,
     )
 
@@ -428,34 +427,34 @@ def _direction(axis: Element | None) -> list[float]:
     return [float(word) for word in text.split()] or [1.0, 0.0, 0.0]
 
 
-def _limits(limit_element: Element | None, where: str) -> tuple[float, float] | None:
+def _limits(limit_element: Element | None, location: str) -> tuple[float, float] | None:
     """Return the stated range; in URDF one missing end is zero."""
-    limits = _stated_limits(limit_element, where)
+    limits = _stated_limits(limit_element, location)
     if limits == [None, None] or max(abs(x or 0.0) for x in limits) > LIMITS.joint_limit:
         return None
     return limits[0] or 0.0, limits[1] or 0.0
 
 
-def _stated_limits(limit_element: Element | None, where: str) -> list[float | None]:
+def _stated_limits(limit_element: Element | None, location: str) -> list[float | None]:
     return [
-        finite_number(limit_element, name, f"{where}: limit", math.inf)
+        finite_number(limit_element, name, f"{location}: limit", math.inf)
         for name in ("lower", "upper")
     ]
 
 
-def _mimic(element: Element, where: str) -> Coupling | None:
+def _mimic(element: Element, location: str) -> Coupling | None:
     mimic = element.find("mimic")
     if mimic is None or element.get("type") == "fixed":
         return None
-    where = f"{where}: mimic"
-    ratio = finite_number(mimic, "multiplier", where)
-    offset = finite_number(mimic, "offset", where)
-    leader = required_attribute(mimic, "joint", where)
+    location = f"{location}: mimic"
+    ratio = finite_number(mimic, "multiplier", location)
+    offset = finite_number(mimic, "offset", location)
+    leader = required_attribute(mimic, "joint", location)
     return Linear(leader, 1.0 if ratio is None else ratio, offset or 0.0)
 
 
 MACRO_TAGS = ("{http://www.ros.org/wiki/xacro}", "{http://ros.org/wiki/xacro}")
-"""Prefixes of the tags of macros."""
+"""XML namespaces of macros."""
 
 
 def read_tree(path: Path, xacro: bool | Sequence[str] = False) -> RobotTree:
@@ -463,8 +462,8 @@ def read_tree(path: Path, xacro: bool | Sequence[str] = False) -> RobotTree:
 
     Args:
         path: URDF, xacro or MJCF.
-        xacro: Values of its arguments, NAME:=VALUE; True: expand macros although the file is not
-            called ``.xacro``.
+        xacro: Values of the file's arguments, NAME:=VALUE; True: expand macros although the name
+            of the file does not end with ``.xacro``.
 
     Raises:
         DescriptionError: The file is missing or malformed; the message names file and joint.
@@ -475,7 +474,9 @@ def read_tree(path: Path, xacro: bool | Sequence[str] = False) -> RobotTree:
     arguments = () if isinstance(xacro, bool) else tuple(xacro)
     for word in arguments:
         if not re.fullmatch(r"\w+:=.*", word):
-            raise DescriptionError(f"{path}: xacro: argument {word!r} is not NAME:=VALUE")
+            raise DescriptionError(
+                f"{path}: xacro: argument {word!r} is invalid; expected NAME:=VALUE"
+            )
     return _read(path, stamp, bool(xacro) or path.suffix == ".xacro", arguments)
 
 
@@ -496,6 +497,6 @@ def _read(path: Path, _: int, xacro: bool, arguments: tuple[str, ...]) -> RobotT
         if child.tag.startswith(MACRO_TAGS):
             raise DescriptionError(
                 f"{path}: found macros (<xacro:{child.tag.rpartition('}')[2]}>), expected plain "
-                "URDF; to expand them, call the file .xacro, or import it with --xacro"
+                "URDF; to expand them, rename the file to .xacro or import it with --xacro"
             )
     return replace(read_urdf(element, path), notes=notes)

@@ -86,7 +86,7 @@ def _check_structure(text: str) -> None:
     parser.Parse(text.encode("utf-8"), True)
 
 
-def required_attribute(element: Element | None, name: str, where: str) -> str:
+def required_attribute(element: Element | None, name: str, location: str) -> str:
     """Return an attribute of an element.
 
     Raises:
@@ -94,7 +94,7 @@ def required_attribute(element: Element | None, name: str, where: str) -> str:
     """
     value = None if element is None else element.get(name)
     if not value:
-        raise DescriptionError(f"{where}: {name}: missing")
+        raise DescriptionError(f"{location}: {name}: missing")
     return value
 
 
@@ -114,14 +114,14 @@ def check_size(links: int, moving: int, path: Path) -> None:
 
 
 def finite_number(
-    element: Element | None, name: str, where: str, max_value: float = LIMITS.robot_number
+    element: Element | None, name: str, location: str, max_value: float = LIMITS.robot_number
 ) -> float | None:
     """Return a number of an element; None if it is missing.
 
     Args:
         element: The element; None if it is missing.
         name: Name of the attribute.
-        where: File and key, for the message.
+        location: File and key, for the message.
         max_value: Largest absolute value.
 
     Raises:
@@ -136,7 +136,7 @@ def finite_number(
         value = math.nan
     if not (math.isfinite(value) and abs(value) <= max_value):
         raise DescriptionError(
-            f"{where}: {name}: found {text!r}, expected a finite number{_range_text(max_value)}"
+            f"{location}: {name}: found {text!r}, expected a finite number{_range_text(max_value)}"
         )
     return value
 
@@ -145,7 +145,7 @@ def _range_text(max_value: float) -> str:
     return f" up to {max_value:g}" if math.isfinite(max_value) else ""
 
 
-def check_vector(element: Element | None, name: str, where: str) -> None:
+def check_vector(element: Element | None, name: str, location: str) -> None:
     """Refuse an attribute that is not three finite numbers; it may be missing.
 
     Raises:
@@ -161,7 +161,7 @@ def check_vector(element: Element | None, name: str, where: str) -> None:
     max_value = LIMITS.robot_number
     if len(values) != 3 or not all(abs(value) <= max_value for value in values):
         raise DescriptionError(
-            f"{where}: {name}: found {text!r}, expected three finite numbers"
+            f"{location}: {name}: found {text!r}, expected three finite numbers"
             f"{_range_text(max_value)}"
         )
 
@@ -376,31 +376,31 @@ class RobotTree:
         """Joints by name."""
         return {joint.name: joint for joint in self.joints}
 
-    def chain(self, root: str, link: str, where: str) -> tuple[TreeJoint, ...]:
+    def chain(self, root: str, link: str, location: str) -> tuple[TreeJoint, ...]:
         """Return the joints between two links.
 
         Args:
             root: The upper link.
             link: The lower link.
-            where: File and key, for the message.
+            location: File and key, for the message.
 
         Raises:
             DescriptionError: The lower link is not below the upper one.
         """
         chain = chain_to(self, link, root)
         if (chain[0].parent if chain else link) != root:
-            raise DescriptionError(f"{where}: link {link!r} is not below link {root!r}")
+            raise DescriptionError(f"{location}: link {link!r} is not below link {root!r}")
         return tuple(chain)
 
-    def require_link(self, link: str, where: str) -> str:
+    def require_link(self, link: str, location: str) -> str:
         """Return a link if it exists.
 
         Raises:
             DescriptionError: The link does not exist; the message lists the links.
         """
-        return require_name(link, self.links, "link", where)
+        return require_name(link, self.links, "link", location)
 
-    def require_joint(self, joint: str, where: str) -> str:
+    def require_joint(self, joint: str, location: str) -> str:
         """Return a joint if it exists.
 
         Raises:
@@ -409,7 +409,7 @@ class RobotTree:
         movable = [tree_joint.name for tree_joint in self.joints if tree_joint.type != "fixed"]
         if joint in self.by_name:
             return joint
-        return require_name(joint, movable, "joint", where)
+        return require_name(joint, movable, "joint", location)
 
 
 def fixed_tree_joint(name: str, parent: str, child: str, placement: Array) -> TreeJoint:

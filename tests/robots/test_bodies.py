@@ -161,12 +161,12 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
             "sides.left.palm: unknown link 'no_such'; known",
         ),
         ("link: left_tip", "link: nope", "sides.left.fingers.tip.link: unknown link 'nope'"),
-        ("{tip: {link: left_tip, normal: [0, 0, 1]}}", "{}", "sides.left.fingers: found none"),
+        ("{tip: {link: left_tip, normal: [0, 0, 1]}}", "{}", "sides.left.fingers: is empty"),
         ("{palm: left", "{thumb: toe, palm: left", "sides.left.thumb: side 'left' has no finger"),
         ("sides:", "trunk: nowhere\nsides:", "trunk: unknown link 'nowhere'; known: base"),
         ("sides:", "trunk: base\nsides:", "joint 'waist' beyond it moves every palm; expected"),
         ("two.urdf", "tow.urdf", "robot.file: {folder}/tow.urdf: no such file"),
-        ("two.urdf", "two.urdf, palm: torso", "robot.palm: found one, expected it under each of"),
+        ("two.urdf", "two.urdf, palm: torso", "robot.palm: is not allowed"),
         ("sides:", "colour: red\nsides:", "colour"),
     ],
 )
@@ -180,7 +180,7 @@ def test_arms_stand_at_places_that_are_all_given(tmp_path: Path):
     sides = ", at: {xyz: [0, 0.3, 0]}", ""
     text = "name: pair\ntrunk: lift\nsides:\n  left: " + given + "\n  right: " + given + "\n"
     path.write_text(text % sides)
-    refused(path, "sides.right.at: found none, expected one as in sides.left")
+    refused(path, "sides.right.at: missing; expected a pose as in sides.left")
     path.write_text(text % (sides[0], ", at: {}"))
     robot = ik.load_robot(path)
     apart = robot.palm(robot.home, "left") - robot.palm(robot.home, "right")
@@ -199,10 +199,10 @@ def refused(path: Path, said: str):
 @pytest.mark.parametrize(
     ("follower", "leader", "said"),
     [
-        ("right_finger", "left_finger", "sides.right: {} which is of side 'left'"),
-        ("left_wrist", "right_finger", "sides.left: {} which is of side 'right'"),
-        ("right_shoulder", "waist", "sides.right: {} which is of the trunk"),
-        ("waist", "left_wrist", "trunk: {} which is of side 'left'"),
+        ("right_finger", "left_finger", "sides.right: {} which belongs to side 'left'"),
+        ("left_wrist", "right_finger", "sides.left: {} which belongs to side 'right'"),
+        ("right_shoulder", "waist", "sides.right: {} which belongs to the trunk"),
+        ("waist", "left_wrist", "trunk: {} which belongs to side 'left'"),
     ],
 )
 def test_a_motor_of_two_sides_is_refused(in_a_file: Path, follower: str, leader: str, said: str):
@@ -222,12 +222,12 @@ def test_a_motor_of_two_sides_is_refused(in_a_file: Path, follower: str, leader:
         (
             "hand: allegro_left",
             "hand: allegro_left, fingers: [thumb, toe]",
-            "sides.left.fingers: allegro_left has no finger 'toe'; it has thumb, index, ",
+            "sides.left.fingers: allegro_left has no finger 'toe'; expected one of: thumb, index, ",
         ),
         (
             "hand: allegro_left",
             "hand: allegro_left, fingers: [index], thumb: thumb",
-            "sides.left.thumb: 'thumb' is not among the fingers",
+            "sides.left.thumb: 'thumb' is not one of the fingers",
         ),
     ],
 )

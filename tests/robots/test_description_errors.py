@@ -19,11 +19,11 @@ hand | normal: => nrmal:
 hand | root: bh_base => #
     (top level) | `root`
 robot | finger_3] => finger_4]
-    fingers | no finger 'finger_4'; it has
+    fingers | no finger 'finger_4'; expected
 robot | thumb: thumb => thumb: fist
-    thumb | no finger 'fist'; it has
+    thumb | no finger 'fist'; expected
 robot | [thumb, f => [f
-    thumb | not among the fingers
+    thumb | 'thumb' is not one
 robot | finger_3] => finger_2]
     fingers | 'finger_2' appears twice
 arm | [-120 deg, 120 deg] => [120 deg, -120 deg]
@@ -35,7 +35,7 @@ hand | {limits: [0 deg, 180 deg], velocity: 2 rad/s, source: limits assumed} => 
 hand | actuators:\n => actuators:\n  spare: {limits: [0, 1], source: mdh}\n
     actuators.spare | moves no joint
 hand | actuators:\n => actuators:\n  bh_finger_2_spread: {}\n
-    actuators.bh_finger_2_spread | follows 'bh_spread' already
+    actuators.bh_finger_2_spread | 'bh_spread'
 hand | 180 deg], velocity: 2 rad/s => 180 deg], velocity: 0
     actuators.bh_spread.velocity | expected > 0
 hand | source: limits assumed}\n  bh_thumb_prox => }\n  bh_thumb_prox
@@ -75,9 +75,9 @@ arm | , source: centro} => }
 arm | source: centro => source: ''
     joint 'lwr_joint_1': source | empty
 arm | source: centro => source: centro myself
-    joint 'lwr_joint_1': source | unknown tag 'myself'; sources: centro, isir
+    joint 'lwr_joint_1': source | 'myself' is unknown; expected one of: centro, isir
 hand | source: pad cad => source: guess
-    fingers.thumb.source | unknown tag 'guess'
+    fingers.thumb.source | 'guess' is unknown
 arm | tip: {link: lwr_flange, source: centro} => tip: {link: lwr_flange}
     tip.source | empty
 hand | palm: {link: bh_base, xyz: [0, 0, 80 mm], source: palm} => palm: {link: bh_base}
@@ -93,7 +93,7 @@ hand | normal: [0, 1, 0] => normal: [0, 0, 0]
 robot | lwr_joint_4: -90 deg => lwr_joint_4: -121 deg
     home.lwr_joint_4 | -2.11185 is outside the limits [-2.0944, 2.0944]
 robot | lwr_joint_4: => lwr_joint_9:
-    home.lwr_joint_9 | no such actuator; known: lwr_joint_1
+    home.lwr_joint_9 | is unknown; expected one of: lwr_joint_1
 robot | bh_spread: 30 deg => bh_spread: wide
     home.bh_spread | wide
 arm | 110 mm => 110 inch

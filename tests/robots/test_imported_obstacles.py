@@ -45,7 +45,7 @@ name="left_spread" type="revolute" => name="left_spread" type="floating"
 child link="right_1" => child link="left_1"
     joint 'right_spread': link 'left_1' has two parents; expected a tree
 <link name="left_2"/> => <link name="left_2"/><link name="more"/>
-    found several base links (base_link, more), expected one: join them by a fixed joint
+    several base links (base_link, more)
 joint="left_bend" => joint="elbow"
     mimics 'elbow', which is not a joint
 joint="left_bend" => joint="left_end"
@@ -98,13 +98,13 @@ hand: {file: hand.urdf, limits: {left_bend: [2, 1]}}
 hand: {file: hand.urdf}\nrobot: {file: hand.urdf}
     expected either 'hand' or 'robot'
 hand: {file: hand.urdf} / none
-    fingers: found none
+    fingers: is empty
 hand: {file: hand.urdf, locked: {left_spread: 0, left_bend: 0}}
-    fingers.left.link: no joint moves 'left_tip' against the palm 'base_link'
+    fingers.left.link: no joint moves 'left_tip' relative to the palm 'base_link'
 hand: {file: hand.urdf, lokced: {}}
     lokced
 hand: {file: hand.urdf}\nthumb: big
-    has no finger 'big'; it has left
+    has no finger 'big'; expected one of: left
 """
 OTHER_FINGERS = {
     "": FINGERS,
@@ -129,7 +129,7 @@ def test_refused_descriptions(tmp_path, written, says):
         ("<a>" * 100_000, "elements nested more than 200 deep"),
         ("<html></html>", "found <html>, expected a URDF (<robot>) or an MJCF (<mujoco>)"),
         ("<robot name='x'/>", "the base link is missing"),
-        ("<robot name='x'><link name='a'/></robot>", "has no joints (1 links)"),
+        ("<robot name='x'><link name='a'/></robot>", "(1 links)"),
         ("", "not valid XML: no element found"),
         ("\xff\xfe", "not UTF-8 text"),
     ],

@@ -129,10 +129,10 @@ class OrderConverter:
         is_decided: True if the order is known and used from now on.
     """
 
-    def __init__(self, where: str) -> None:
+    def __init__(self, location: str) -> None:
         """Store the name of the argument, for warnings."""
         self.name, self.is_decided = "", False
-        self._where, self._tries = where, 0
+        self._where, self._tries = location, 0
         self._newest: Array | None = None
 
     def assume_standard(self) -> None:

@@ -12,13 +12,13 @@ from casadi_ik.errors import InputError
 
 
 def checked_number(
-    value: Any, where: str, expected: str, low: float = -math.inf, high: float = math.inf
+    value: Any, location: str, expected: str, low: float = -math.inf, high: float = math.inf
 ) -> float:
     """Return an argument as a finite number.
 
     Args:
         value: The argument.
-        where: Name of the argument, for the message.
+        location: Name of the argument, for the message.
         expected: Kind and range of the number, for the message.
         low: Smallest value.
         high: Largest value.
@@ -28,19 +28,19 @@ def checked_number(
     """
     is_number = isinstance(value, (int, float, np.integer, np.floating))
     if not is_number or isinstance(value, bool) or not (low <= value <= high):
-        raise InputError(f"{where}: found {value!r}, expected {expected}")
+        raise InputError(f"{location}: found {value!r}, expected {expected}")
     number = float(value) if abs(value) <= 1e300 else math.inf
     if not math.isfinite(number):
-        raise InputError(f"{where}: found {value!r}, expected {expected}")
+        raise InputError(f"{location}: found {value!r}, expected {expected}")
     return number
 
 
-def checked_integer(value: Any, where: str, minimum: int) -> int:
+def checked_integer(value: Any, location: str, minimum: int) -> int:
     """Return an argument as an integer.
 
     Args:
         value: The argument.
-        where: Name of the argument, for the message.
+        location: Name of the argument, for the message.
         minimum: Smallest value.
 
     Raises:
@@ -51,5 +51,5 @@ def checked_integer(value: Any, where: str, minimum: int) -> int:
     except TypeError:
         number = minimum - 1
     if isinstance(value, bool) or number < minimum:
-        raise InputError(f"{where}: found {value!r}, expected an integer >= {minimum}")
+        raise InputError(f"{location}: found {value!r}, expected an integer >= {minimum}")
     return number

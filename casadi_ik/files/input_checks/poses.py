@@ -53,12 +53,12 @@ def nearest_rotations(matrices: Array) -> tuple[Array, Bools]:
     return np.where((inexact | invalid)[..., None, None], left @ right, matrices), invalid
 
 
-def checked_rotations(matrices: Array, where: str) -> Array:
+def checked_rotations(matrices: Array, location: str) -> Array:
     """Return the nearest rotations (..., 3, 3) of finite matrices.
 
     Args:
         matrices: (..., 3, 3).
-        where: Name of the argument, or file and key.
+        location: Name of the argument, or file and key.
 
     Raises:
         InvalidPoseError: A matrix differs too much from a rotation.
@@ -66,7 +66,7 @@ def checked_rotations(matrices: Array, where: str) -> Array:
     rotations, invalid = nearest_rotations(matrices)
     if invalid.any():
         row = f"[{int(np.argmax(invalid))}]" if invalid.ndim else ""
-        raise InvalidPoseError(f"{where}{row}: {rotation_problem(matrices[invalid][0])}")
+        raise InvalidPoseError(f"{location}{row}: {rotation_problem(matrices[invalid][0])}")
     return rotations
 
 
@@ -138,7 +138,7 @@ def unit_quaternions(quaternions: Array) -> tuple[Array, Bools]:
     return quaternions / divisors[..., None], invalid
 
 
-def checked_quaternion(quaternion: ArrayLike, where: str) -> Array:
+def checked_quaternion(quaternion: ArrayLike, location: str) -> Array:
     """Return a quaternion (4,) normalised, with its order of components.
 
     Raises:
@@ -147,12 +147,12 @@ def checked_quaternion(quaternion: ArrayLike, where: str) -> Array:
     """
     values = np.asarray(quaternion, dtype=float)
     if values.shape != (4,):
-        raise InputError(f"{where}: found shape {values.shape}, expected a quaternion (4,)")
+        raise InputError(f"{location}: found shape {values.shape}, expected a quaternion (4,)")
     unit, invalid = unit_quaternions(values)
     if invalid:
         length = float(np.linalg.norm(values))
         raise InvalidPoseError(
-            f"{where}: found length {length:.6g}, expected 1 (within {MAX_LENGTH_ERROR:g})"
+            f"{location}: found length {length:.6g}, expected 1 (within {MAX_LENGTH_ERROR:g})"
         )
     return unit
 

@@ -31,12 +31,12 @@ INTERVAL_UNITS = (
 """Median interval from which times are probably in a unit, the unit, and its length [s]."""
 
 
-def check_time_unit(times: Array, where: str, max_interval: float = MAX_FRAME_INTERVAL) -> None:
+def check_time_unit(times: Array, location: str, max_interval: float = MAX_FRAME_INTERVAL) -> None:
     """Refuse times of frames that are probably not in seconds.
 
     Args:
         times: (k,) increasing numbers.
-        where: File and key.
+        location: File and key.
         max_interval: Median interval at and above which they are refused [s].
 
     Raises:
@@ -51,18 +51,18 @@ def check_time_unit(times: Array, where: str, max_interval: float = MAX_FRAME_IN
         (name, factor) for start, name, factor in INTERVAL_UNITS if interval >= start
     )
     raise InputError(
-        f"{where}: frames are {interval:.4g} s apart; expected seconds, less than {max_interval:g} "
-        f"between frames (numbers in {unit}? multiply by {factor:g})"
+        f"{location}: frames are {interval:.4g} s apart; expected seconds, less than "
+        f"{max_interval:g} between frames (numbers in {unit}? multiply by {factor:g})"
     )
 
 
-def cycle_count(seconds: float, period: float, where: str) -> int:
+def cycle_count(seconds: float, period: float, location: str) -> int:
     """Return the number of cycles of a motion, rounded up.
 
     Args:
         seconds: Duration of the motion [s].
         period: Duration of a cycle [s].
-        where: Name of the argument, or file and key.
+        location: Name of the argument, or file and key.
 
     Raises:
         InputError: There are more cycles than `FileLimits.stream_cycles`.
@@ -70,7 +70,7 @@ def cycle_count(seconds: float, period: float, where: str) -> int:
     count, max_count = seconds / period, scaled_limit(LIMITS.stream_cycles)
     if not count <= max_count:
         raise InputError(
-            f"{where}: {seconds:.4g} s in cycles of {period:.4g} s are {count:.4g} cycles; "
+            f"{location}: {seconds:.4g} s in cycles of {period:.4g} s are {count:.4g} cycles; "
             f"expected at most {max_count:,} {RAISE_HINT}"
         )
     return math.ceil(count)

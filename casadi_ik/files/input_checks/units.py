@@ -47,12 +47,12 @@ def _warn(message: str) -> None:
     warnings.warn(message, InputWarning, stacklevel=3)
 
 
-def warn_of_far_contacts(points: Array, where: str, base_travel: float = 0.0) -> None:
+def warn_of_far_contacts(points: Array, location: str, base_travel: float = 0.0) -> None:
     """Warn of contact points (..., 3) that are more than `UsualSizes.contact` from the base.
 
     Args:
         points: Contact points [m]; NaN where free.
-        where: Name of the argument, or file and key.
+        location: Name of the argument, or file and key.
         base_travel: Distance that a mobile base travels [m].
     """
     max_distance = USUAL_SIZES.contact + base_travel
@@ -61,38 +61,39 @@ def warn_of_far_contacts(points: Array, where: str, base_travel: float = 0.0) ->
         return
     distance = float(np.linalg.norm(points[beyond.any(axis=-1)][0]))
     _warn(
-        f"{where}: a contact is {distance:.4g} m from the robot's base; expected at most "
+        f"{location}: a contact is {distance:.4g} m from the robot's base; expected at most "
         f"{max_distance:.4g} m (numbers in mm? 1 mm is 0.001)"
     )
 
 
-def warn_of_wide_tolerance(position: float, angle: float, where: str = "tolerance") -> None:
+def warn_of_wide_tolerance(position: float, angle: float, location: str = "tolerance") -> None:
     """Warn of a tolerance above `UsualSizes.position` or `UsualSizes.angle`.
 
     Args:
         position: Largest distance of the contact point [m].
         angle: Largest angle of the normal [rad].
-        where: Name of the argument, or file and key.
+        location: Name of the argument, or file and key.
     """
     if position > USUAL_SIZES.position * (1 + ROUNDING_MARGIN):
         _warn(
-            f"{where}.position: found {position:g} m; expected at most {USUAL_SIZES.position:g} m "
-            "(a number in mm? 1 mm is 0.001)"
+            f"{location}.position: found {position:g} m; expected at most "
+            f"{USUAL_SIZES.position:g} m (a number in mm? 1 mm is 0.001)"
         )
     if angle > USUAL_SIZES.angle * (1 + ROUNDING_MARGIN):
         _warn(
-            f"{where}.angle: found {angle:g} rad ({math.degrees(angle):.4g} deg); expected at most "
-            f"{USUAL_SIZES.angle:.3g} rad (30 deg; a number in degrees? use np.deg2rad({angle:g}))"
+            f"{location}.angle: found {angle:g} rad ({math.degrees(angle):.4g} deg); expected "
+            f"at most {USUAL_SIZES.angle:.3g} rad (30 deg; a number in degrees? use "
+            f"np.deg2rad({angle:g}))"
         )
 
 
-def warn_of_obstacle(distance: float, size: float, where: str) -> None:
+def warn_of_obstacle(distance: float, size: float, location: str) -> None:
     """Warn of an obstacle that is very large or very far away.
 
     Args:
         distance: Distance of its origin from the base [m].
         size: Its edge or diameter [m].
-        where: Name of the scene or file, and key.
+        location: Name of the scene or file, and key.
     """
     if size > USUAL_SIZES.obstacle * (1 + ROUNDING_MARGIN):
         problem, bound = f"a solid is {size:.4g} m large", USUAL_SIZES.obstacle
@@ -101,19 +102,19 @@ def warn_of_obstacle(distance: float, size: float, where: str) -> None:
         bound = USUAL_SIZES.obstacle_away
     else:
         return
-    _warn(f"{where}: {problem}; expected at most {bound:g} m (numbers in mm? 1 mm is 0.001)")
+    _warn(f"{location}: {problem}; expected at most {bound:g} m (numbers in mm? 1 mm is 0.001)")
 
 
-def warn_of_large_mesh(points: Array, where: str) -> None:
+def warn_of_large_mesh(points: Array, location: str) -> None:
     """Warn of a mesh with corners (k, 3) whose box has an edge above `UsualSizes.mesh`.
 
     Args:
         points: Corners, scaled [m].
-        where: File, or file and key.
+        location: File, or file and key.
     """
     size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if size > USUAL_SIZES.mesh * (1 + ROUNDING_MARGIN):
         _warn(
-            f"{where}: the mesh is {size:.4g} m large; expected at most {USUAL_SIZES.mesh:g} m (a "
-            "mesh in mm? its scale is 0.001)"
+            f"{location}: the mesh is {size:.4g} m large; expected at most "
+            f"{USUAL_SIZES.mesh:g} m (a mesh in mm? its scale is 0.001)"
         )

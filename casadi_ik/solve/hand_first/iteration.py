@@ -21,7 +21,7 @@ from casadi_ik.kinematics.contact_fit import FIT, MINIMAX, TOLERANT_FIT, initial
 from casadi_ik.kinematics.contacts import LENGTH, kinds_suffix
 from casadi_ik.kinematics.palm import NUMERIC_ARM_PARAMETERS, start_table
 from casadi_ik.model.description import RobotDescription, Side
-from casadi_ik.model.joining import MAX_SIDES
+from casadi_ik.model.multi_arm import MAX_SIDES
 from casadi_ik.solve.hand_first.parameters import STAGE_PARAMETERS, TRUNK_PARAMETERS
 from casadi_ik.solve.hand_first.state import COUNTER_OF_STAGE, SIDE_OFFSET, STAGE_RESULT, Stage
 from casadi_ik.solve.hand_first.step import HandFirstStep
