@@ -3,7 +3,7 @@
 The bounds move the joints from the centres of their intervals successively, the distal joint of a
 finger first. A rotation by delta about an axis at the distance rho moves a point by
 2 rho sin(delta / 2), and a unit normal at the angle alpha to the axis by
-2 sin(alpha) sin(delta / 2); the motion of the more distal joints adds at most its size to rho
+2 sin(alpha) sin(delta / 2); the motion of distal joints adds at most its size to rho
 and to sin(alpha). The same distances bound the remainder of a linearisation at the centre: the
 norm of the second derivative of a point by two joints is at most its distance from the axis of the
 distal joint.

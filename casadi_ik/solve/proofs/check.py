@@ -1,0 +1,338 @@
+"""Independent check that a target is impossible.
+
+The check shares the premises (`proofs.premises`) with the prover, but none of its bounds: it proves
+the target impossible in numpy, with simpler bounds and finer boxes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from casadi_ik.files.arrays import Array, Bools, Rows
+from casadi_ik.kinematics.arms.recognise import srs_arm
+from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.proofs.contact_balls import ContactBalls, contact_balls, wrist_distances
+from casadi_ik.solve.proofs.premises import (
+    LIMIT_MARGIN,
+    NO_CONE_LIMIT,
+    ArmCones,
+    arm_cones,
+    arm_span,
+    fingers_without_limits,
+    joint_limits,
+    motor_box,
+    motor_limits,
+)
+
+CHECK_MARGIN = 1e-8
+"""Margin against rounding errors [m, rad], ten times that of the prover."""
+
+
+@dataclass(frozen=True)
+class CheckEffort:
+    """Limits of the check of a proof; a proof that exceeds them is not confirmed.
+
+    Attributes:
+        max_boxes: Maximum number of boxes.
+        boxes_per_pass: Number of boxes evaluated together.
+        elbow_samples: Number of samples of the swivel angle of the elbow.
+        min_box_effect: Smallest motion of a contact within a box that is divided [0.1 m, rad].
+    """
+
+    max_boxes: int = 400_000
+    boxes_per_pass: int = 512
+    elbow_samples: int = 180
+    min_box_effect: float = 1e-5
+
+
+class Refutation:
+    """Bisection of the box of hand postures until every part is refuted."""
+
+    def __init__(
+        self, robot: RobotDescription, target: TargetBatch, fingers: list[int], uses_arm: bool
+    ) -> None:
+        """Prepare the check of one target.
+
+        Args:
+            robot: Description of the robot.
+            target: Target with the tolerances of the proof.
+            fingers: Indices of the fingers whose contacts are contradictory.
+            uses_arm: True to refute boxes by the reach of the arm too.
+        """
+        self.robot, self.target, self.fingers, self.uses_arm = robot, target, fingers, uses_arm
+        self.motors = robot.finger_motors
+        self.effort = CheckEffort()
+        self.in_palm = any(j.type != "fixed" for j in robot.chain(robot.palm_link))
+        self.limits = joint_limits(robot, target)
+        self.points, self.normals = target.points[0, fingers], target.normals[0, fingers]
+        self.position_margin = target.position_tolerance[fingers] + CHECK_MARGIN
+        self.angle_margin = target.angle_tolerance[fingers] + CHECK_MARGIN
+
+    def succeeds(self) -> bool:
+        """Return True if every box is refuted within the effort of a check."""
+        bounds = motor_box(self.robot, self.target)
+        is_unbounded = fingers_without_limits(self.robot, bounds)
+        if any(is_unbounded[i] for i in self.fingers):
+            return False
+        queue, count = [bounds[None]], 0
+        while queue:
+            boxes = queue.pop()
+            count += len(boxes)
+            if count > self.effort.max_boxes:
+                return False
+            balls = contact_balls(
+                self.robot,
+                self.motors,
+                (boxes[:, 0], boxes[:, 1]),
+                self.limits,
+                self.fingers,
+                self.in_palm,
+            )
+            refuted, scores = self._check(balls)
+            open_rows = np.flatnonzero(~(balls.is_empty | refuted))
+            boxes, scores = boxes[open_rows], scores[open_rows]
+            widest = scores.argmax(axis=1)
+            if (
+                balls.effect[open_rows][np.arange(len(open_rows)), widest]
+                < self.effort.min_box_effect
+            ).any():
+                return False
+            halves, size = bisect(boxes, widest), self.effort.boxes_per_pass
+            queue += [halves[i : i + size] for i in range(0, len(halves), size)]
+        return True
+
+    def _check(self, balls: ContactBalls) -> tuple[Bools, Array]:
+        """Return (k,) True for refuted boxes, and the effect of each motor (k, h)."""
+        radius, angle = balls.radius + self.position_margin, balls.angle + self.angle_margin
+        if not self.in_palm:
+            too_far = np.linalg.norm(self.points - balls.points, axis=2) > radius
+            too_rotated = angle_of(self.normals, balls.normals) > angle
+            return (too_far | too_rotated).any(axis=1), balls.effect
+        refuted, scores = self._check_pairs(balls, radius, angle)
+        refuted[~refuted] = self._check_rigid_fit(balls, radius, angle, ~refuted)
+        if self.uses_arm:
+            refuted |= self._check_reach(balls, radius)
+            rows = np.flatnonzero(~refuted)
+            refuted[rows] = self._check_cones(balls.rows(rows), radius[rows])
+        return refuted, scores
+
+    def _check_pairs(self, balls: ContactBalls, radius: Array, angle: Array) -> tuple[Bools, Array]:
+        """Return (k,) True for boxes without admissible distances and angles of pairs of contacts.
+
+        The second result has the scores of the motors (k, h), which are highest for motors that
+        affect nearly violated conditions; boxes are divided along them.
+        """
+        refuted, scores = np.zeros(len(radius), dtype=bool), 0.1 * balls.effect
+        for i, j in combinations(range(len(self.fingers)), 2):
+            target, line = self.points[j] - self.points[i], balls.points[:, j] - balls.points[:, i]
+            radii = radius[:, i] + radius[:, j]
+            target_distance, distance = np.linalg.norm(target), np.linalg.norm(line, axis=1)
+            point_shares = balls.point_shares[:, i] + balls.point_shares[:, j]
+            tests = [
+                (
+                    np.abs(distance - target_distance) - CHECK_MARGIN * target_distance,
+                    radii,
+                    point_shares,
+                )
+            ]
+            target_angle = angle_of(self.normals[i], self.normals[j])
+            hand_angle = angle_of(balls.normals[:, i], balls.normals[:, j])
+            normal_shares = balls.normal_shares[:, i] + balls.normal_shares[:, j]
+            tests.append(
+                (np.abs(hand_angle - target_angle), angle[:, i] + angle[:, j], normal_shares)
+            )
+            # The line between the points rotates by at most asin(radii / target_distance).
+            with np.errstate(divide="ignore", invalid="ignore"):
+                line_rotation = np.arcsin(np.clip(radii / target_distance, 0.0, 1.0))
+                line_rotation[radii >= target_distance] = np.pi
+                for n in (i, j):
+                    deviation = np.abs(
+                        angle_of(balls.normals[:, n], line) - angle_of(self.normals[n], target)
+                    )
+                    shares = balls.normal_shares[:, n] + point_shares / target_distance
+                    tests.append((deviation, angle[:, n] + line_rotation, shares))
+                for deviation, width, shares in tests:
+                    ratio = np.nan_to_num(deviation / width)
+                    refuted |= ratio > 1
+                    scores += np.nan_to_num(ratio[:, None] ** 4 * shares / width[:, None])
+        return refuted, scores
+
+    def _check_rigid_fit(
+        self, balls: ContactBalls, radius: Array, angle: Array, rows: Bools
+    ) -> Bools:
+        """Return (k,) True for boxes without a rigid fit (Kabsch) within the bounds."""
+        w = 1 / radius[rows] ** 2
+        chord = 2 * np.sin(np.minimum(angle[rows], np.pi) / 2)
+        has_normal = ~np.isnan(self.normals[:, 0])
+        v = has_normal / chord**2
+        target_normals = np.nan_to_num(self.normals)
+        total = w.sum(axis=1, keepdims=True)
+        x = balls.points[rows] - ((w[:, :, None] * balls.points[rows]).sum(axis=1) / total)[:, None]
+        y = self.points - ((w[:, :, None] * self.points).sum(axis=1) / total)[:, None]
+        S = np.einsum("kf,kfi,kfj->kij", w, x, y)
+        S += np.einsum("kf,kfi,fj->kij", v, balls.normals[rows], target_normals)
+        singular_values = np.linalg.svd(S, compute_uv=False)
+        trace = (
+            singular_values[:, 0]
+            + singular_values[:, 1]
+            + np.sign(np.linalg.det(S)) * singular_values[:, 2]
+        )
+        size = (w * ((x**2).sum(axis=2) + (y**2).sum(axis=2)) + 2 * v).sum(axis=1)
+        allowed = len(self.fingers) + has_normal.sum()
+        return size * (1 - 1e-9) - 2 * trace > allowed
+
+    def _check_reach(self, balls: ContactBalls, radius: Array) -> Bools:
+        """Return (k,) True for boxes whose wrist is out of the reach of the arm."""
+        shoulder, wrist, nearest, farthest = self._arm
+        target_distance = np.linalg.norm(self.points - shoulder, axis=1)
+        wrist_distance = np.linalg.norm(wrist - balls.points, axis=2)
+        is_refuted = (target_distance - wrist_distance - radius > farthest) | (
+            wrist_distance - radius - target_distance > farthest
+        )
+        is_refuted |= target_distance + wrist_distance + radius < nearest
+        centre, margin = self._palm_ball(balls, radius, wrist, 1)
+        distance = np.linalg.norm(centre - shoulder, axis=1)
+        is_refuted = (
+            is_refuted.any(axis=1) | (distance - margin > farthest) | (distance + margin < nearest)
+        )
+        position_margin = (
+            self.position_margin + CHECK_MARGIN,
+            2 * np.sin(np.minimum(self.angle_margin, np.pi) / 2) + CHECK_MARGIN,
+        )
+        smallest, largest = wrist_distances(
+            balls, (self.points, self.normals), position_margin, shoulder, wrist
+        )
+        return is_refuted | (smallest > farthest) | (largest < nearest)
+
+    def _palm_ball(
+        self, balls: ContactBalls, radius: Array, p_palm: Array, sum_of_points: int
+    ) -> tuple[Array, Array]:
+        """Return centres (k, 3) and radii (k,) of balls that contain a vector of the palm.
+
+        The vector is a weighted sum of contacts and normals: a point if `sum_of_points` is 1, and
+        a direction if it is 0.
+        """
+        has_normal = ~np.isnan(self.normals[:, 0])
+        chord = 2 * np.sin(np.minimum(balls.angle + self.angle_margin, np.pi) / 2)
+        first_point, first_target = balls.points[:, :1], self.points[0]
+        # The vector is the first contact plus a combination of differences of contacts and normals.
+        columns = np.concatenate(
+            [balls.points[:, 1:] - first_point, balls.normals[:, has_normal]], axis=1
+        )
+        targets = np.concatenate([self.points[1:] - first_target, self.normals[has_normal]])
+        position_margin = np.concatenate(
+            [radius[:, 1:] + radius[:, :1], chord[:, has_normal]], axis=1
+        )
+        A = columns / position_margin[:, :, None]
+        normal = np.einsum("kfi,kfj->kij", A, A)
+        normal += (1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-300) * np.eye(3)
+        offset = p_palm - sum_of_points * first_point[:, 0]
+        solved = np.linalg.solve(normal, offset[:, :, None])[:, :, 0]
+        coefficients = np.einsum("kfi,ki->kf", A, solved) / position_margin
+        unexplained = offset - np.einsum("kf,kfi->ki", coefficients, columns)
+        n = len(self.fingers) - 1
+        radius_of_ball = np.linalg.norm(unexplained, axis=1) + CHECK_MARGIN
+        radius_of_ball += radius[:, 0] * np.abs(sum_of_points - coefficients[:, :n].sum(axis=1))
+        radius_of_ball += (np.abs(coefficients[:, :n]) * radius[:, 1:]).sum(axis=1)
+        radius_of_ball += (np.abs(coefficients[:, n:]) * chord[:, has_normal]).sum(axis=1)
+        return sum_of_points * first_target + coefficients @ targets, radius_of_ball
+
+    def _check_cones(self, balls: ContactBalls, radius: Array) -> Bools:
+        """Return (k,) True for boxes in which every swivel angle violates a limit of the arm."""
+        is_refuted = np.zeros(len(radius), dtype=bool)
+        if self._cones is None or not len(radius):
+            return is_refuted
+        cones, (_, _, nearest, farthest) = self._cones, self._arm
+        centre, wrist_margin = self._palm_ball(balls, radius, cones.wrist, 1)
+        shoulder_to_wrist, length = (
+            centre - cones.shoulder,
+            np.linalg.norm(centre - cones.shoulder, axis=1),
+        )
+        rows = np.flatnonzero(wrist_margin < length)
+        smallest = np.clip(length - wrist_margin, max(nearest, 1e-6), None)[rows]
+        largest = np.maximum(np.clip(length + wrist_margin, None, farthest)[rows], smallest)
+        tilt = np.arcsin(wrist_margin[rows] / length[rows]) + CHECK_MARGIN
+        direction = shoulder_to_wrist[rows] / length[rows, None]
+        axis, position_margin = self._palm_ball(balls.rows(rows), radius[rows], cones.last, 0)
+        helper = np.eye(3)[np.abs(direction).argmin(axis=1)]
+        x = np.cross(direction, helper)
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        y, step = np.cross(direction, x), 2 * np.pi / self.effort.elbow_samples
+        is_feasible = np.zeros(len(rows), dtype=bool)
+        (upper_angle, upper_margin), (forearm_angle, forearm_margin) = (
+            _triangle_angle(a, b, smallest, largest)
+            for a, b in (cones.lengths, reversed(cones.lengths))
+        )
+        cosines = self._cosines
+        for swivel in step * np.arange(self.effort.elbow_samples):
+            radial = np.cos(swivel) * x + np.sin(swivel) * y
+            upper_arm = (
+                np.cos(upper_angle)[:, None] * direction + np.sin(upper_angle)[:, None] * radial
+            )
+            forearm = (
+                np.cos(forearm_angle)[:, None] * direction - np.sin(forearm_angle)[:, None] * radial
+            )
+            # Between two samples a direction rotates by at most half a step.
+            a = upper_arm @ cones.first + tilt + upper_margin + step / 2
+            b = (forearm * axis).sum(axis=1) + position_margin + tilt + forearm_margin + step / 2
+            is_feasible |= (a >= cosines[0]) & (b >= cosines[1])
+        is_refuted[rows] = ~is_feasible
+        return is_refuted
+
+    @cached_property
+    def _cones(self) -> ArmCones | None:
+        cones = arm_cones(self.robot)
+        return (
+            None if cones is None or (cones.cosines(self.target) == NO_CONE_LIMIT).all() else cones
+        )
+
+    @cached_property
+    def _cosines(self) -> Array:
+        assert self._cones is not None
+        return self._cones.cosines(self.target)
+
+    @cached_property
+    def _arm(self) -> tuple[Array, Array, float, float]:
+        """Shoulder, wrist (palm frame), smallest and largest distance between them [m]."""
+        arm = srs_arm(self.robot)
+        if arm is None:
+            span = arm_span(self.robot)
+            assert span is not None
+            return span.shoulder, span.wrist, *span.span(self.target)
+        elbow = self.robot.arm_actuators[3]
+        lower, upper = (np.clip(end, -1e3, 1e3) for end in motor_limits(self.robot, self.target))
+        distances = arm.reach(lower[elbow] - LIMIT_MARGIN, upper[elbow] + LIMIT_MARGIN)
+        nearest, farthest = (float(end) for end in distances)
+        return arm.shoulder, arm.wrist_in_palm, nearest - CHECK_MARGIN, farthest + CHECK_MARGIN
+
+
+def _triangle_angle(a: float, b: float, nearest: Array, farthest: Array) -> tuple[Array, Array]:
+    """Return midpoint and half width of the angle between sides a and c in [nearest, farthest]."""
+    sides = [nearest, farthest]
+    if a > b:
+        sides.append(np.clip(np.sqrt(a * a - b * b), nearest, farthest))
+    angles = [np.arccos(np.clip((c * c + a * a - b * b) / (2 * a * c), -1, 1)) for c in sides]
+    low, high = np.min(angles, axis=0), np.max(angles, axis=0)
+    return (low + high) / 2, (high - low) / 2 + CHECK_MARGIN
+
+
+def bisect(boxes: Array, widest: Rows) -> Array:
+    """Bisect boxes (k, 2, h) along one motor each (k,) into (2 k, 2, h)."""
+    rows = np.arange(len(boxes))
+    middle = boxes.mean(axis=1)[rows, widest]
+    low, high = boxes.copy(), boxes.copy()
+    low[rows, 1, widest], high[rows, 0, widest] = middle, middle
+    return np.concatenate([low, high])
+
+
+def angle_of(a: Array, b: Array) -> Array:
+    """Return the angles between vectors along the last axis [rad]; NaN where one is NaN."""
+    a = a / np.linalg.norm(a, axis=-1, keepdims=True)
+    b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+    difference, total = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
+    return 2 * np.arctan2(difference, total)
