@@ -186,9 +186,9 @@ class Page:
             time.sleep(0.05)
         return value
 
-    def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
+    def mouse(self, kind: str, x: float, y: float, **details: Any) -> None:
         """Send a mouse event: Pressed, Moved, Released or Wheel, at x, y [CSS pixels]."""
-        self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **more)
+        self.call("Input.dispatchMouseEvent", type=f"mouse{kind}", x=x, y=y, **details)
 
     def click(self, x: float, y: float) -> None:
         """Press and release the left button at x, y [CSS pixels]."""

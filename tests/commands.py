@@ -7,10 +7,10 @@ from casadi_ik.app.cli.lists import schema_of
 from casadi_ik.app.cli.main import main
 from casadi_ik.app.cli.table import COMMANDS, GROUPS, load, parse
 
-__all__ = ["COMMANDS", "GROUPS", "load", "main", "schema_of", "shown"]
+__all__ = ["COMMANDS", "GROUPS", "load", "main", "schema_of", "view_of"]
 
 
-def shown(*words: str) -> viewing.Viewer:
+def view_of(*words: str) -> viewing.Viewer:
     """What `casadi-ik view` shows, without waiting until it is stopped."""
     from casadi_ik.app.cli.view import open_viewer
 

@@ -106,12 +106,12 @@ def browser() -> Iterator[Browser]:
 @pytest.fixture
 def view() -> Iterator[Callable[..., Viewer]]:
     """What `casadi-ik view` with some words shows, without waiting until it is stopped."""
-    from commands import shown
+    from commands import view_of
 
     with ExitStack() as stack:
 
         def open_page(*words: str) -> Viewer:
-            viewer = shown(*words)
+            viewer = view_of(*words)
             stack.callback(viewer.stop)
             return viewer
 

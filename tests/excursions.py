@@ -31,14 +31,14 @@ def excursion(
     axes = np.random.default_rng(0).normal(size=(len(hands), 3))
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     for share in np.concatenate([smooth, smooth[::-1], np.zeros(round(4 / period))]):
-        moved, turned = points.copy(), normals.copy()
+        moved_points, turned_normals = points.copy(), normals.copy()
         for rows, axis in zip(hands, axes, strict=True):
             middle = points[rows].mean(axis=0)
             if kind == "out":
-                way = np.array([1.0, 0.0, 0.0]) if sides else middle / np.linalg.norm(middle)
-                moved[rows] += share * way
+                direction = np.array([1.0, 0.0, 0.0]) if sides else middle / np.linalg.norm(middle)
+                moved_points[rows] += share * direction
             else:
                 turn = Rotation.from_rotvec(share * np.radians(170) * axis)
-                moved[rows] = middle + turn.apply(points[rows] - middle)
-                turned[rows] = turn.apply(normals[rows])
-        yield moved, turned
+                moved_points[rows] = middle + turn.apply(points[rows] - middle)
+                turned_normals[rows] = turn.apply(normals[rows])
+        yield moved_points, turned_normals

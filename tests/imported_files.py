@@ -11,8 +11,8 @@ fingers:
 """
 
 
-def link(*names: str, inside: str = "") -> str:
-    end = f">{inside}</link>" if inside else "/>"
+def link(*names: str, content: str = "") -> str:
+    end = f">{content}</link>" if content else "/>"
     return "".join(f'<link name="{name}"{end}\n' for name in names)
 
 
@@ -26,13 +26,13 @@ def joint(
     rpy: str = "0 0 0",
     axis: str = "1 0 0",
     limit: str = 'lower="-1" upper="1.5" velocity="2" effort="1"',
-    more: str = "",
+    attributes: str = "",
 ) -> str:
     ends = f'<parent link="{parent}"/><child link="{child}"/>'
     origin = f'<origin xyz="{xyz}" rpy="{rpy}"/>'
     axis_ = f'<axis xyz="{axis}"/>' if kind not in ("fixed", "floating") else ""
     limit_ = f"<limit {limit}/>" if limit and kind in ("revolute", "prismatic") else ""
-    return f'<joint name="{name}" type="{kind}">{origin}{ends}{axis_}{limit_}{more}</joint>\n'
+    return f'<joint name="{name}" type="{kind}">{origin}{ends}{axis_}{limit_}{attributes}</joint>\n'
 
 
 def urdf(path: Path, *parts: str) -> Path:
@@ -48,7 +48,7 @@ def hand(folder: Path, *changes: tuple[str, str], name: str = "hand.urdf") -> Pa
         text += joint(f"{side}_spread", "base_link", f"{side}_1", xyz=place, rpy=rpy, axis="0 0 1")
         text += joint(f"{side}_bend", f"{side}_1", f"{side}_2", axis="1 0.2 0")
         mimic = f'<mimic joint="{side}_bend" multiplier="0.5" offset="0.1"/>'
-        text += joint(f"{side}_end", f"{side}_2", f"{side}_tip", xyz="0 0 0.04", more=mimic)
+        text += joint(f"{side}_end", f"{side}_2", f"{side}_tip", xyz="0 0 0.04", attributes=mimic)
     for old, new in changes:
         assert old in text, old
         text = text.replace(old, new)

@@ -23,13 +23,13 @@ def hand(bend: float, wrist: Array, turn: float = 0.0) -> Array:
     for finger in range(5):
         across = 0.02 * (finger - 2)
         base = np.array([0.03, -0.05, -0.02]) if finger == 0 else np.array([0.09, across, 0.0])
-        way = 0.9 if finger == 0 else 0.0
+        slope = 0.9 if finger == 0 else 0.0
         points.append(base)
         angle = 0.0
         for bone in BONES:
             angle += bend
-            along = np.array([np.cos(angle), way * np.cos(angle), -np.sin(angle)])
-            points.append(points[-1] + bone * along / np.linalg.norm(along))
+            bone_vector = np.array([np.cos(angle), slope * np.cos(angle), -np.sin(angle)])
+            points.append(points[-1] + bone * bone_vector / np.linalg.norm(bone_vector))
     c, s = np.cos(turn), np.sin(turn)
     return np.array(points) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + wrist
 

@@ -40,14 +40,16 @@ def _four_bar(bar: FourBar, phi: np.ndarray) -> np.ndarray:
     """Coupler angle by intersecting two circles, of both the one like the known pose."""
     pin = bar.p * np.exp(1j * phi)
     line = bar.g - pin
-    along = (np.abs(line) ** 2 + bar.h**2 - bar.q**2) / (2 * np.abs(line))
-    across = np.sqrt(bar.h**2 - along**2)
+    crank_fraction = (np.abs(line) ** 2 + bar.h**2 - bar.q**2) / (2 * np.abs(line))
+    across = np.sqrt(bar.h**2 - crank_fraction**2)
     unit = line / np.abs(line)
-    found = []
+    solutions = []
     for side in (1, -1):
-        angle = np.angle((along + side * 1j * across) * unit * np.exp(-1j * phi))
-        found.append((angle - bar.theta_3_0 + np.pi) % (2 * np.pi) - np.pi)
-    return np.where(np.abs(found[0]).mean() < np.abs(found[1]).mean(), found[0], found[1])
+        angle = np.angle((crank_fraction + side * 1j * across) * unit * np.exp(-1j * phi))
+        solutions.append((angle - bar.theta_3_0 + np.pi) % (2 * np.pi) - np.pi)
+    return np.where(
+        np.abs(solutions[0]).mean() < np.abs(solutions[1]).mean(), solutions[0], solutions[1]
+    )
 
 
 def contacts(robot: ik.ArmHand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -68,16 +70,16 @@ def links(robot: ik.ArmHand, values: dict[str, np.ndarray]) -> dict[str, np.ndar
     for joint in robot.description.joints:
         pose = poses[joint.parent] @ joint.placement
         if joint.type == "prismatic":
-            moved = np.tile(np.eye(4), (count, 1, 1))
-            moved[:, :3, 3] = values[joint.name][:, None] * joint.axis
-            pose = pose @ moved
+            moved_poses = np.tile(np.eye(4), (count, 1, 1))
+            moved_poses[:, :3, 3] = values[joint.name][:, None] * joint.axis
+            pose = pose @ moved_poses
         elif joint.type == "revolute":
-            pose = pose @ _turned(joint.axis, values[joint.name])
+            pose = pose @ _rotation_about(joint.axis, values[joint.name])
         poses[joint.child] = pose
     return poses
 
 
-def _turned(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def _rotation_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
     """Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

@@ -47,11 +47,11 @@ class PinocchioRobot:
         """(6, m) twist [v; w] of a frame per movable joint, in our order of joints."""
         pin.computeJointJacobians(self.model, self.data, self.configuration(q))
         pin.updateFramePlacements(self.model, self.data)
-        found = pin.getFrameJacobian(
+        frame_jacobian = pin.getFrameJacobian(
             self.model, self.data, self.model.getFrameId(frame, pin.FrameType.BODY), reference
         )
         ids = [self.model.getJointId(name) for name in self.robot.description.joint_names]
-        return found[:, [self.model.joints[i].idx_v for i in ids]]
+        return frame_jacobian[:, [self.model.joints[i].idx_v for i in ids]]
 
 
 def verdict(oracle: PinocchioRobot, q, points, normals) -> tuple[np.ndarray, np.ndarray]:
@@ -71,9 +71,9 @@ def assert_verdicts(oracle: PinocchioRobot, batch, points, normals, enforce: boo
         np.testing.assert_allclose(batch.position_error[row], position, atol=1e-11)
         np.testing.assert_allclose(batch.angle_error[row], angle, atol=1e-11)
         theta = oracle.configuration(q)
-        inside = np.all(theta >= model.lowerPositionLimit - 1e-9)
-        inside &= np.all(theta <= model.upperPositionLimit + 1e-9)
-        inside &= np.all(q >= robot.lower - 1e-9) and np.all(q <= robot.upper + 1e-9)
-        assert batch.limits_ok[row] == inside
-        met = np.all(position <= usual.position) and np.all(angle <= usual.angle)
-        assert batch.success[row] == (met and (inside or not enforce))
+        is_within_limits = np.all(theta >= model.lowerPositionLimit - 1e-9)
+        is_within_limits &= np.all(theta <= model.upperPositionLimit + 1e-9)
+        is_within_limits &= np.all(q >= robot.lower - 1e-9) and np.all(q <= robot.upper + 1e-9)
+        assert batch.limits_ok[row] == is_within_limits
+        is_met = np.all(position <= usual.position) and np.all(angle <= usual.angle)
+        assert batch.success[row] == (is_met and (is_within_limits or not enforce))

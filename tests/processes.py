@@ -31,13 +31,18 @@ def python(*words: object, path: object = ROOT, **options: Any) -> subprocess.Co
         options: As `subprocess.run` has them; `env` is what differs from this process.
     """
     changed = {"PYTHONPATH": str(path)} | options.pop("env", {})
-    asked = {"capture_output": True, "text": True, "timeout": 600, "env": os.environ | changed}
+    run_options = {
+        "capture_output": True,
+        "text": True,
+        "timeout": 600,
+        "env": os.environ | changed,
+    }
     return subprocess.run(
-        [sys.executable, *(textwrap.dedent(str(word)) for word in words)], **asked | options
+        [sys.executable, *(textwrap.dedent(str(word)) for word in words)], **run_options | options
     )
 
 
-def said(*words: object, **options: Any) -> str:
+def output_of(*words: object, **options: Any) -> str:
     """What a program says that ends well; options as `subprocess.run` has them.
 
     Raises:

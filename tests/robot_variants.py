@@ -37,8 +37,8 @@ def derived_robot(
                 if number in pair and offset:
                     origin["xyz"] = [offset if number == pair[0] else -offset, 0, origin["xyz"][2]]
     if mount is not None:
-        with edited(path) as whole:
-            whole["mount"] = {"xyz": mount[0], "rpy": mount[1]}
+        with edited(path) as data:
+            data["mount"] = {"xyz": mount[0], "rpy": mount[1]}
     return ik.load_robot(path)
 
 
@@ -52,10 +52,10 @@ def part_of_the_arm(folder: Path, joints: slice) -> Path:
         names = [joint["name"] for joint in arm["joints"]]
         arm["home"] = {name: value for name, value in arm["home"].items() if name in names}
         del arm["collision"]
-    with edited(path) as whole:
-        kept = whole["home"].items()
-        whole["home"] = {n: v for n, v in kept if n in names or n.startswith("bh")}
-        whole.pop("collision", None)
+    with edited(path) as data:
+        home_entries = data["home"].items()
+        data["home"] = {n: v for n, v in home_entries if n in names or n.startswith("bh")}
+        data.pop("collision", None)
     return path
 
 
@@ -71,28 +71,30 @@ def thumb_of(folder: Path, joints: int) -> ik.ArmHand:
         if joints == 1:
             distal |= {"type": "fixed", "limits": [0, 0]}
             del hand["actuators"][distal["name"]]
-            with edited(path) as whole:
-                del whole["home"][distal["name"]]
-        more = []
+            with edited(path) as data:
+                del data["home"][distal["name"]]
+        extra_lines = []
         if joints >= 3:
             place = {"xyz": proximal["origin"]["xyz"], "rpy": [0, 0, 0]}
-            more.append(_revolute("thumb_turn", proximal["parent"], "thumb_base", [0, 0, 1], place))
+            extra_lines.append(
+                _revolute("thumb_turn", proximal["parent"], "thumb_base", [0, 0, 1], place)
+            )
             proximal["parent"] = "thumb_base"
             proximal["origin"]["xyz"] = [0, 0, 0]
         if joints == 4:
             place = {"xyz": [0.03, 0, 0], "rpy": [0, 0, 0]}
-            more.append(
+            extra_lines.append(
                 _revolute("thumb_roll", distal["parent"], "thumb_rolling", [1, 0, 0], place)
             )
             distal["parent"] = "thumb_rolling"
             distal["origin"]["xyz"] = [0.04, 0, 0]
         hand["joints"] = sorted(
-            more + hand["joints"], key=lambda joint: joint["name"] != "thumb_turn"
+            extra_lines + hand["joints"], key=lambda joint: joint["name"] != "thumb_turn"
         )
         if joints == 4:
-            roll = hand["joints"].index(more[1])
+            roll = hand["joints"].index(extra_lines[1])
             hand["joints"].insert(2, hand["joints"].pop(roll))
-        hand["actuators"] = {joint["name"]: {} for joint in more} | hand["actuators"]
+        hand["actuators"] = {joint["name"]: {} for joint in extra_lines} | hand["actuators"]
     return ik.load_robot(path)
 
 

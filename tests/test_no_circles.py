@@ -23,13 +23,13 @@ def imported_modules(path: Path, modules: set[str]) -> set[str]:
     """
 
     def imports(node: ast.AST) -> set[str]:
-        found: set[str] = set()
+        imports_found: set[str] = set()
         if isinstance(node, ast.Import):
-            found = {alias.name for alias in node.names}
+            imports_found = {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            inside = {f"{node.module}.{alias.name}" for alias in node.names} & modules
-            found = inside or {node.module}
-        return found.union(*map(imports, ast.iter_child_nodes(node)))
+            submodules = {f"{node.module}.{alias.name}" for alias in node.names} & modules
+            imports_found = submodules or {node.module}
+        return imports_found.union(*map(imports, ast.iter_child_nodes(node)))
 
     return imports(ast.parse(path.read_text(encoding="utf-8"))) & modules - {module_name(path)}
 

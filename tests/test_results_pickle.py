@@ -24,21 +24,21 @@ COPIES = {
 }
 
 
-def same(a: Any, b: Any, depth: int = 0) -> bool:
+def is_same(a: Any, b: Any, depth: int = 0) -> bool:
     """Return whether two results hold the same public data."""
     if type(a) is not type(b) or depth > 8:
         return type(a) is type(b)
     if isinstance(a, np.ndarray):
         return a.dtype == b.dtype and a.tobytes() == b.tobytes()
     if isinstance(a, Mapping):
-        return a.keys() == b.keys() and all(same(a[key], b[key], depth + 1) for key in a)
+        return a.keys() == b.keys() and all(is_same(a[key], b[key], depth + 1) for key in a)
     if isinstance(a, str | Enum | bytes):
         return a == b
     if dataclasses.is_dataclass(a):
         names = [item.name for item in dataclasses.fields(a)]
-        return all(same(getattr(a, name), getattr(b, name), depth + 1) for name in names)
+        return all(is_same(getattr(a, name), getattr(b, name), depth + 1) for name in names)
     if isinstance(a, Sequence):
-        return len(a) == len(b) and all(same(x, y, depth + 1) for x, y in zip(a, b, strict=True))
+        return len(a) == len(b) and all(is_same(x, y, depth + 1) for x, y in zip(a, b, strict=True))
     if isinstance(a, float):
         return a == b or (np.isnan(a) and np.isnan(b))
     return not isinstance(a, int) or a == b
@@ -116,14 +116,14 @@ KINDS = (
 )
 
 
-@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize("copy_kind", COPIES)
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_result_survives_copying(results: dict[str, Any], kind: str, how: str) -> None:
+def test_a_result_survives_copying(results: dict[str, Any], kind: str, copy_kind: str) -> None:
     value = results[kind]
     assert value is not None
-    again = COPIES[how](value)
-    assert same(again, value)
-    assert str(again).split(" at 0x")[0] == str(value).split(" at 0x")[0]
+    copied = COPIES[copy_kind](value)
+    assert is_same(copied, value)
+    assert str(copied).split(" at 0x")[0] == str(value).split(" at 0x")[0]
 
 
 @pytest.mark.parametrize("kind", KINDS)

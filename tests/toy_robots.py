@@ -134,7 +134,7 @@ def grasps_of(robot: ik.ArmHand, points: np.ndarray, normals: np.ndarray) -> lis
     return [grasp_of(robot, *pair) for pair in zip(points, normals, strict=True)]
 
 
-def moved(targets, rng, metres, angle):
+def moved_targets(targets, rng, metres, angle):
     """Contacts (k, f, 3) moved and their normals turned by so much, any way."""
     points, normals = targets
     shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)

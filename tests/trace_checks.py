@@ -35,7 +35,7 @@ LENGTH = 0.1
 """Position errors weigh in a cost by this [m]."""
 
 
-class Kept:
+class TraceRecorder:
     """A recorder that keeps the blocks in memory."""
 
     def __init__(self) -> None:
@@ -132,14 +132,14 @@ def _in(block: SolveBlock, phases: tuple[Phase, ...]) -> NDArray[np.bool_]:
 
 def _check_errors(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> None:
     """Distances and angles are those of the row's q."""
-    wanted = _in(block, promise.whole)
-    assert wanted.any()
-    rows, of_solve = block.rows[wanted], _of_solve(block)[wanted]
+    in_promise = _in(block, promise.whole)
+    assert in_promise.any()
+    rows, of_solve = block.rows[in_promise], _of_solve(block)[in_promise]
     points, normals = robot.contacts(rows[Q.name].astype(float))
     goal = block.targets.points[of_solve], block.targets.normals[of_solve]
     distance = np.linalg.norm(points - goal[0], axis=2)
-    turned = np.linalg.norm(np.cross(normals, goal[1]), axis=2)
-    angle = np.arctan2(turned, np.sum(normals * goal[1], axis=2))
+    sine = np.linalg.norm(np.cross(normals, goal[1]), axis=2)
+    angle = np.arctan2(sine, np.sum(normals * goal[1], axis=2))
     np.testing.assert_allclose(rows[POSITION_ERROR.name], distance, rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(rows[ANGLE_ERROR.name], angle, rtol=1e-4, atol=1e-6)
 
@@ -147,25 +147,27 @@ def _check_errors(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> Non
 def _pairs(block: SolveBlock, phases: tuple[Phase, ...]) -> NDArray[np.intp]:
     """Rows whose next one is of the same solve, phase and start, in one of the phases."""
     of_solve, phase = _of_solve(block), block.rows[PHASE.name]
-    same = (of_solve[1:] == of_solve[:-1]) & (phase[1:] == phase[:-1]) & _in(block, phases)[1:]
+    same_phase = (
+        (of_solve[1:] == of_solve[:-1]) & (phase[1:] == phase[:-1]) & _in(block, phases)[1:]
+    )
     if RESTART.name in block.format.layout.names:
         restart = block.rows[RESTART.name]
-        same &= restart[1:] == restart[:-1]
-    return np.flatnonzero(same)
+        same_phase &= restart[1:] == restart[:-1]
+    return np.flatnonzero(same_phase)
 
 
 def _check_step(block: SolveBlock, promise: Promise) -> None:
     """A step taken is as long as the way between two rows."""
     pairs = _pairs(block, promise.step)
     assert len(pairs)
-    told = pairs if promise.before else pairs + 1
-    way = np.abs(block.rows[Q.name][pairs + 1] - block.rows[Q.name][pairs]).max(axis=1)
-    size = block.rows[STEP_SIZE.name][told]
-    taken = np.ones(len(pairs), dtype=bool)
+    step_rows = pairs if promise.before else pairs + 1
+    max_steps = np.abs(block.rows[Q.name][pairs + 1] - block.rows[Q.name][pairs]).max(axis=1)
+    size = block.rows[STEP_SIZE.name][step_rows]
+    is_checked = np.ones(len(pairs), dtype=bool)
     if ACCEPTED.name in block.format.layout.names:
-        taken = block.rows[ACCEPTED.name][told] > 0
-    assert taken.any()
-    np.testing.assert_allclose(size[taken], way[taken], rtol=1e-4, atol=1e-9)
+        is_checked = block.rows[ACCEPTED.name][step_rows] > 0
+    assert is_checked.any()
+    np.testing.assert_allclose(size[is_checked], max_steps[is_checked], rtol=1e-4, atol=1e-9)
 
 
 def _check_limits(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> None:
@@ -192,31 +194,31 @@ def _check_phases(block: SolveBlock) -> None:
 
 def _check_status(block: SolveBlock) -> None:
     """The last row says how it ended; no row before says that it was solved."""
-    seen = 0
+    status_rows = 0
     for row, rows in _solves(block):
         ended = Status(int(block.batch.status[row]))
         if ended is Status.SOLVED:
             assert rows[STATUS.name][-1] == Status.SOLVED
-            seen += 1
+            status_rows += 1
         assert not np.any(rows[STATUS.name][:-1] == Status.SOLVED)
-    assert seen
+    assert status_rows
 
 
 def _check_cost(block: SolveBlock, promise: Promise) -> None:
     """The squares of all contacts, by the errors of the row; while the hand is fitted no less."""
     position, angle = block.rows[POSITION_ERROR.name], block.rows[ANGLE_ERROR.name]
-    known = ~np.isnan(position).any(axis=1)
-    assert known.any()
+    is_known = ~np.isnan(position).any(axis=1)
+    assert is_known.any()
     # Where errors are measured, the cost is, and the other way round.
-    np.testing.assert_array_equal(np.isnan(block.rows[COST.name]), ~known)
-    turned = angle if promise.normals == "angle" else 2 * np.sin(angle / 2)
-    squares = (position / LENGTH) ** 2 + turned**2
+    np.testing.assert_array_equal(np.isnan(block.rows[COST.name]), ~is_known)
+    normal_error = angle if promise.normals == "angle" else 2 * np.sin(angle / 2)
+    squares = (position / LENGTH) ** 2 + normal_error**2
     squares[:, block.fingers.index("thumb")] *= promise.thumb_weight
-    cost, least = block.rows[COST.name], squares.sum(axis=1)
-    whole = known & _in(block, promise.whole)
-    np.testing.assert_allclose(cost[whole], least[whole], rtol=1e-3, atol=1e-12)
+    cost, square_sum = block.rows[COST.name], squares.sum(axis=1)
+    in_promise = is_known & _in(block, promise.whole)
+    np.testing.assert_allclose(cost[in_promise], square_sum[in_promise], rtol=1e-3, atol=1e-12)
     # The fit of a hand also counts how far the palm is out of the arm's reach.
-    assert (cost[known] >= (1 - 1e-3) * least[known] - 1e-12).all()
+    assert (cost[is_known] >= (1 - 1e-3) * square_sum[is_known] - 1e-12).all()
 
 
 def _check_restarts(block: SolveBlock) -> None:
@@ -226,38 +228,42 @@ def _check_restarts(block: SolveBlock) -> None:
         steps = np.diff(rows[RESTART.name].astype(int), prepend=0)
         assert np.isin(steps, (0, 1)).all(), row
         # A solve that ends in vain says so in a row beyond its last start.
-        over = int(rows[STATUS.name][-1] == Status.STALLED)
+        final_row = int(rows[STATUS.name][-1] == Status.STALLED)
         assert (
-            block.batch.restarts[row] <= rows[RESTART.name][-1] <= block.batch.restarts[row] + over
+            block.batch.restarts[row]
+            <= rows[RESTART.name][-1]
+            <= block.batch.restarts[row] + final_row
         )
 
 
 def _check_accepted(block: SolveBlock, promise: Promise) -> None:
     """A step that is taken moves the robot, lowers the cost and eases the damping."""
     pairs = _pairs(block, promise.step)
-    told = pairs if promise.before else pairs + 1
-    taken = block.rows[ACCEPTED.name][told] > 0
-    assert taken.any()
-    assert not taken.all()
-    moved = np.any(block.rows[Q.name][pairs + 1] != block.rows[Q.name][pairs], axis=1)
-    np.testing.assert_array_equal(moved, taken)
+    step_rows = pairs if promise.before else pairs + 1
+    is_accepted = block.rows[ACCEPTED.name][step_rows] > 0
+    assert is_accepted.any()
+    assert not is_accepted.all()
+    has_moved = np.any(block.rows[Q.name][pairs + 1] != block.rows[Q.name][pairs], axis=1)
+    np.testing.assert_array_equal(has_moved, is_accepted)
     cost = block.rows[COST.name]
-    np.testing.assert_array_equal(cost[pairs + 1] < cost[pairs], taken)
+    np.testing.assert_array_equal(cost[pairs + 1] < cost[pairs], is_accepted)
     damping = block.rows[DAMPING.name]
-    assert (damping[pairs[~taken] + 1] > damping[pairs[~taken]]).all() or not promise.before
-    assert (damping[told] > 0).all()
+    assert (
+        damping[pairs[~is_accepted] + 1] > damping[pairs[~is_accepted]]
+    ).all() or not promise.before
+    assert (damping[step_rows] > 0).all()
 
 
 def _check_active(block: SolveBlock) -> None:
     """What a step brought to its limit it held there."""
     n = block.rows[Q.name].shape[1]
     at = _bits(block.rows[LIMIT_MASK.name], n)
-    held = _bits(block.rows[ACTIVE_MASK.name], n)
+    is_active = _bits(block.rows[ACTIVE_MASK.name], n)
     pairs = _pairs(block, PROMISES[block.method].step)
     come = at[pairs + 1] & ~at[pairs]
     assert come.any()
-    assert held[pairs + 1][come].all()
+    assert is_active[pairs + 1][come].all()
     # And it holds nothing that it leaves.
-    taken = block.rows[ACCEPTED.name][pairs + 1] > 0
-    gone = at[pairs] & ~at[pairs + 1]
-    assert not held[pairs + 1][taken][gone[taken]].any()
+    is_accepted = block.rows[ACCEPTED.name][pairs + 1] > 0
+    released = at[pairs] & ~at[pairs + 1]
+    assert not is_active[pairs + 1][is_accepted][released[is_accepted]].any()

@@ -38,12 +38,12 @@ def tracked(positions: np.ndarray | None) -> OptionalTensorGroup:
 
 def flat_hand() -> np.ndarray:
     """An open hand in the plane x-y: wrist at 0, fingers along y."""
-    found = np.zeros((26, 3))
+    poses = np.zeros((26, 3))
     for finger, begin in enumerate((2, 6, 11, 16, 21)):
         count = 4 if finger == 0 else 5
         reach = np.linspace(0.02, 0.1 if finger == 0 else 0.18, count)
-        found[begin : begin + count] = np.outer(reach, [0.3 - 0.15 * finger, 1, 0])
-    return found
+        poses[begin : begin + count] = np.outer(reach, [0.3 - 0.15 * finger, 1, 0])
+    return poses
 
 
 def test_a_tracked_hand_moves_the_robot_and_a_lost_one_stops_it(tmp_path):
@@ -52,27 +52,27 @@ def test_a_tracked_hand_moves_the_robot_and_a_lost_one_stops_it(tmp_path):
     follower = ik.Solver(robot).follow(robot.home, period=0.01)
     config = ik.motion.load_retarget(tmp_path / "hand.yaml")
     node = ArmHandRetargeter("arm_hand", robot, config, follower)
-    assert [one.name for one in node.output_types()["joints"].types] == list(robot.actuators)
+    assert [joint.name for joint in node.output_types()["joints"].types] == list(robot.actuators)
 
     def q(hand: OptionalTensorGroup, context: ComputeContext | None = None) -> np.ndarray:
         out: TensorGroup = node({"hand_right": hand}, context)["joints"]
         return np.array([out[i] for i in range(len(robot.actuators))])
 
-    rest = q(tracked(None))
-    np.testing.assert_allclose(rest, robot.home, atol=1e-6)
+    q_lost = q(tracked(None))
+    np.testing.assert_allclose(q_lost, robot.home, atol=1e-6)
     hand = flat_hand()
     begin = q(tracked(hand))
     bent = hand.copy()
     bent[[10, 9]] += [[0, -0.05, -0.04], [0, -0.02, -0.03]]  # the index finger
     for _ in range(100):
-        now = q(tracked(bent))
-    moved = np.abs(now - begin)
+        q_bent = q(tracked(bent))
+    step = np.abs(q_bent - begin)
     index = [
         i for i, name in enumerate(robot.actuators) if robot.description.actuators[i].part == "hand"
     ]
-    assert moved[index].max() > 0.1
-    assert (np.abs(now - robot.lower) >= -1e-9).all()
+    assert step[index].max() > 0.1
+    assert (np.abs(q_bent - robot.lower) >= -1e-9).all()
     for _ in range(100):
-        now = q(tracked(None))
-    np.testing.assert_allclose(q(tracked(None)), now, atol=1e-9)
-    np.testing.assert_allclose(q(tracked(None), RESET), now, atol=1e-9)
+        q_bent = q(tracked(None))
+    np.testing.assert_allclose(q(tracked(None)), q_bent, atol=1e-9)
+    np.testing.assert_allclose(q(tracked(None), RESET), q_bent, atol=1e-9)

@@ -41,19 +41,19 @@ def test_a_pose_of_the_tool_through_lerobots_own_step(arm, rng):
     step = InverseKinematicsEEToJoints(kinematics=arm, motor_names=names)
     robot = ik.load_robot("ur5e")
     positions = [*np.rad2deg(robot.home), 30.0]
-    here = {f"{name}.pos": value for name, value in zip(names, positions, strict=True)}
+    observation = {f"{name}.pos": value for name, value in zip(names, positions, strict=True)}
     for q in robot.random(rng, 10):
         pose = arm.forward_kinematics(np.rad2deg(q))
         np.testing.assert_allclose(pose, robot.palm(q), atol=1e-9)
         action = {f"ee.{key}": value for key, value in zip("xyz", pose[:3, 3], strict=True)}
         turn = Rotation.from_matrix(pose[:3, :3]).as_rotvec()
         action |= {f"ee.w{key}": value for key, value in zip("xyz", turn, strict=True)}
-        done = pipeline(step)((action | {"ee.gripper_pos": 42.0}, here))
+        done = pipeline(step)((action | {"ee.gripper_pos": 42.0}, observation))
         assert arm.status is ik.Status.SOLVED
         assert done.pop("gripper.pos") == 42.0
-        there = robot.palm(np.deg2rad([done[f"{name}.pos"] for name in arm.joint_names]))
-        assert np.linalg.norm(there[:3, 3] - pose[:3, 3]) < 5e-3
-        assert np.linalg.norm(there[:3, :3] - pose[:3, :3]) < 0.1
+        pose_sent = robot.palm(np.deg2rad([done[f"{name}.pos"] for name in arm.joint_names]))
+        assert np.linalg.norm(pose_sent[:3, 3] - pose[:3, 3]) < 5e-3
+        assert np.linalg.norm(pose_sent[:3, :3] - pose[:3, :3]) < 0.1
 
 
 def test_the_palm_of_an_arm_with_a_hand(rng):
@@ -62,26 +62,28 @@ def test_the_palm_of_an_arm_with_a_hand(rng):
     assert arm.joint_names == list(robot.actuators[:7])
     q = robot.random(rng, 1)[0][:7]
     pose = arm.forward_kinematics(np.rad2deg(q))
-    found = arm.inverse_kinematics(np.rad2deg(robot.home[:7]), pose)
+    angles = arm.inverse_kinematics(np.rad2deg(robot.home[:7]), pose)
     assert arm.status is ik.Status.SOLVED
-    np.testing.assert_allclose(arm.forward_kinematics(found)[:3, 3], pose[:3, 3], atol=5e-3)
+    np.testing.assert_allclose(arm.forward_kinematics(angles)[:3, 3], pose[:3, 3], atol=5e-3)
     with pytest.raises(ik.errors.InputError, match="expected an arm without a hand"):
-        arm.inverse_kinematics(found, pose, orientation_weight=0)
+        arm.inverse_kinematics(angles, pose, orientation_weight=0)
 
 
 def test_poses_of_a_position_alone_and_out_of_reach(arm):
     robot = ik.load_robot("ur5e")
-    now = np.array([*np.rad2deg(robot.home), 30.0])
+    angles_before = np.array([*np.rad2deg(robot.home), 30.0])
     pose = np.eye(4)
     pose[:3, 3] = 0.4, 0.2, 0.5
-    found = arm.inverse_kinematics(now, pose, orientation_weight=0.0)
-    np.testing.assert_allclose(arm.forward_kinematics(found)[:3, 3], pose[:3, 3], atol=5e-3)
-    assert found[-1] == 30.0
+    angles = arm.inverse_kinematics(angles_before, pose, orientation_weight=0.0)
+    np.testing.assert_allclose(arm.forward_kinematics(angles)[:3, 3], pose[:3, 3], atol=5e-3)
+    assert angles[-1] == 30.0
     pose[:3, 3] = 9, 9, 9
-    reached = arm.forward_kinematics(arm.inverse_kinematics(now, pose))
+    pose_reached = arm.forward_kinematics(arm.inverse_kinematics(angles_before, pose))
     assert arm.status is ik.Status.NEAREST
-    assert reached[:3, 3] @ np.ones(3) / np.sqrt(3) > 0.8
-    np.testing.assert_array_equal(arm.inverse_kinematics(now, np.full((4, 4), np.nan)), now)
+    assert pose_reached[:3, 3] @ np.ones(3) / np.sqrt(3) > 0.8
+    np.testing.assert_array_equal(
+        arm.inverse_kinematics(angles_before, np.full((4, 4), np.nan)), angles_before
+    )
     assert arm.status is ik.Status.INVALID
 
 
@@ -122,13 +124,13 @@ def test_contacts_of_an_action_become_targets_of_the_motors(rng):
         action |= {f"{name}.n{key}": value for key, value in zip("xyz", normal, strict=True)}
     done = pipeline(step)((action | {"speed": 1.0}, {}))
     assert set(done) == {f"{name}.pos" for name in robot.actuators} | {"speed"}
-    there, _ = robot.contacts(np.array([done[f"{name}.pos"] for name in robot.actuators]))
-    assert np.linalg.norm(there - points, axis=1).max() < 5e-3
-    far = {key: value + 9 for key, value in action.items()}
-    reached = pipeline(step)((far, {}))
+    points_reached, _ = robot.contacts(np.array([done[f"{name}.pos"] for name in robot.actuators]))
+    assert np.linalg.norm(points_reached - points, axis=1).max() < 5e-3
+    unreachable = {key: value + 9 for key, value in action.items()}
+    result = pipeline(step)((unreachable, {}))
     assert step.status is ik.Status.NEAREST
-    q = np.array([reached[f"{name}.pos"] for name in robot.actuators])
-    assert robot.contacts(q)[0].mean(axis=0).sum() > there.mean(axis=0).sum()
+    q = np.array([result[f"{name}.pos"] for name in robot.actuators])
+    assert robot.contacts(q)[0].mean(axis=0).sum() > points_reached.mean(axis=0).sum()
     features = step.transform_features({PipelineFeatureType.ACTION: dict.fromkeys(action)})
     assert set(features[PipelineFeatureType.ACTION]) == set(done) - {"speed"}
     step.reset()

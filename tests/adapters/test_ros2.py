@@ -53,9 +53,9 @@ def test_contacts_survive_their_bytes(rng):
     normals[0] = -1, 0, 0
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points[1], normals[2] = np.nan, np.nan
-    found = decode_contacts(encode_contacts(points, normals))
-    np.testing.assert_allclose(found[0], points)
-    np.testing.assert_allclose(found[1], normals, atol=1e-12)
+    decoded = decode_contacts(encode_contacts(points, normals))
+    np.testing.assert_allclose(decoded[0], points)
+    np.testing.assert_allclose(decoded[1], normals, atol=1e-12)
 
 
 @pytest.mark.parametrize("data", [b"", b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 60])
@@ -74,8 +74,8 @@ def test_messages_are_those_of_ros(rng):
     np.testing.assert_allclose(
         [[p.position.x, p.position.y, p.position.z] for p in message.poses], points
     )
-    again = bytes(store.serialize_cdr(message, "geometry_msgs/msg/PoseArray"))
-    assert again == data
+    data_again = bytes(store.serialize_cdr(message, "geometry_msgs/msg/PoseArray"))
+    assert data_again == data
 
 
 @pytest.mark.slow
@@ -101,8 +101,8 @@ def test_a_process_asks_and_another_answers(node, rng):
             message = store.deserialize_cdr(answers.get(timeout=180), "sensor_msgs/msg/JointState")
             times.append(time.perf_counter() - begin)
             assert message.name == list(robot.actuators)
-            there, _ = robot.contacts(np.array(message.position))
-            assert np.linalg.norm(there - points, axis=1).max() < 5e-3
+            points_reached, _ = robot.contacts(np.array(message.position))
+            assert np.linalg.norm(points_reached - points, axis=1).max() < 5e-3
         sys.stdout.write(f"median round trip {1e3 * np.median(times):.2f} ms\n")
         publisher.put(b"nonsense")
         subscriber.undeclare()

@@ -64,20 +64,25 @@ def robot_of(name: str) -> ik.ArmHand:
 
 @cache
 def family(name: str) -> ArmFamily:
-    found = arm_family(robot_of(name).description)
-    assert found is not None
-    return found
+    arm = arm_family(robot_of(name).description)
+    assert arm is not None
+    return arm
 
 
 @cache
-def function(found: ArmFamily) -> ca.Function:
-    return found.arms()
+def function(arm: ArmFamily) -> ca.Function:
+    return arm.arms()
 
 
-def arms(found: ArmFamily, palm: Array, arm: Array, edge: float = 0.0) -> Array:
+def arms(family_of_arm: ArmFamily, palm: Array, arm: Array, edge: float = 0.0) -> Array:
     """All arms (k, n) in reach, a swept joint where a given arm has it; the swivel anywhere."""
-    values = [0.4 if one.joint is None else arm[one.joint] for one in found.redundancy] or [0.0]
-    rows, slack = (np.array(part) for part in function(found)(palm[:3, :3], palm[:3, 3], values))
+    values = [
+        0.4 if redundancy.joint is None else arm[redundancy.joint]
+        for redundancy in family_of_arm.redundancy
+    ] or [0.0]
+    rows, slack = (
+        np.array(part) for part in function(family_of_arm)(palm[:3, :3], palm[:3, 3], values)
+    )
     assert np.isfinite(rows).all()
     return rows[slack.ravel() >= -edge]
 
@@ -94,9 +99,9 @@ def moved_by(screws: Screws, angles: Array) -> Array:
     return pose @ zero
 
 
-def apart(one: Array, other: Array) -> Array:
+def differences(angles: Array, reference: Array) -> Array:
     """Largest difference of angles, whole turns aside."""
-    return np.abs(np.angle(np.exp(1j * (one - other)))).max(axis=-1, initial=0.0)
+    return np.abs(np.angle(np.exp(1j * (angles - reference)))).max(axis=-1, initial=0.0)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -110,16 +115,16 @@ def test_an_arm_is_recognised_by_its_axes(name):
 )
 def test_a_wrist_is_locked_where_there_is_a_family_without_it(name, rng):
     robot = ik.load_robot(name)
-    found = arm_family(robot.description)
-    assert found is not None
-    count = len(found.screws)
-    assert found.locked == (count - 2, count - 1)
-    assert found.kind == f"{KINDS[name.split('+')[0]]}, joints {count - 1}, {count} held"
+    family_arm = arm_family(robot.description)
+    assert family_arm is not None
+    count = len(family_arm.screws)
+    assert family_arm.locked == (count - 2, count - 1)
+    assert family_arm.kind == f"{KINDS[name.split('+')[0]]}, joints {count - 1}, {count} held"
     for q in robot.random(rng, 3):
         arm = q[:count]
-        for each in arms(found, robot.palm(q), arm):
-            np.testing.assert_allclose(each[-2:], arm[-2:])
-            np.testing.assert_allclose(moved_by(found.screws, each), robot.palm(q), atol=1e-9)
+        for row in arms(family_arm, robot.palm(q), arm):
+            np.testing.assert_allclose(row[-2:], arm[-2:])
+            np.testing.assert_allclose(moved_by(family_arm.screws, row), robot.palm(q), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -129,17 +134,17 @@ def test_every_arm_brings_the_palm_there_and_one_is_that_it_was_made_with(name):
     At the edge of reach one arm of two may be missed by an offset wrist; of a swept one the edge is
     that at a position of the swept joint: it is found at another.
     """
-    robot, found, rng = robot_of(name), family(name), np.random.default_rng(1)
-    screws, error, own = arm_screws(robot.description), MODEL_ERROR.get(name, 0.0), []
+    robot, family_arm, rng = robot_of(name), family(name), np.random.default_rng(1)
+    screws, error, own_columns = arm_screws(robot.description), MODEL_ERROR.get(name, 0.0), []
     for q in [*robot.random(rng, 30), *near_limits(robot, rng, 30)]:
         arm = q[: len(screws)]
         palm = moved_by(screws, arm)
-        rows = arms(found, palm, arm, edge=1e-9)
-        for each in rows:
-            np.testing.assert_allclose(moved_by(screws, each), palm, atol=1e-7 + error)
-        own.append(len(rows) > 0 and apart(rows, arm).min() < 1e-5)
-    wanted = {"sawyer": 0.85, "xarm6": 0.99, "kinova_gen3": 0, "kuka_lwr4": 0}
-    assert np.mean(own) >= wanted.get(name, 1.0)
+        rows = arms(family_arm, palm, arm, edge=1e-9)
+        for row in rows:
+            np.testing.assert_allclose(moved_by(screws, row), palm, atol=1e-7 + error)
+        own_columns.append(len(rows) > 0 and differences(rows, arm).min() < 1e-5)
+    expected_shares = {"sawyer": 0.85, "xarm6": 0.99, "kinova_gen3": 0, "kuka_lwr4": 0}
+    assert np.mean(own_columns) >= expected_shares.get(name, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -153,9 +158,9 @@ def test_next_to_a_singular_wrist_every_arm_brings_the_palm_there(name, straight
             q[4] = straight + 10.0**-power
             rows = arms(family(name), robot.palm(q), q)
             assert len(rows)
-            for each in rows:
-                whole = np.concatenate([each, q[len(screws) :]])
-                np.testing.assert_allclose(robot.palm(whole), robot.palm(q), atol=1e-7)
+            for row in rows:
+                full_q = np.concatenate([row, q[len(screws) :]])
+                np.testing.assert_allclose(robot.palm(full_q), robot.palm(q), atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -173,24 +178,24 @@ def test_nothing_is_lost_at_singular_poses(name):
         rows = arms(family(name), palm, arm, edge=1e-9)
         # Stretched out, a nominal arm or an offset wrist may be a little short.
         assert len(rows) or error or name in OFFSET, arm
-        for each in rows:
-            assert np.abs(moved_by(screws, each) - palm).max() < 1e-4 + error
+        for row in rows:
+            assert np.abs(moved_by(screws, row) - palm).max() < 1e-4 + error
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_what_is_in_reach_is_never_said_to_be_beyond_and_far_away_nothing_is_in_reach(name):
-    robot, found = robot_of(name), family(name)
+    robot, arm = robot_of(name), family(name)
     rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
-    lower, upper = (ca.DM(end[: len(found.screws)]) for end in (robot.lower, robot.upper))
-    beyond = found.distance_out_of_reach(Pose(rotation, origin), lower, upper)
-    asked = ca.Function("beyond", [rotation, origin], [beyond])
+    lower, upper = (ca.DM(end[: len(arm.screws)]) for end in (robot.lower, robot.upper))
+    excess = arm.distance_out_of_reach(Pose(rotation, origin), lower, upper)
+    excess_of = ca.Function("beyond", [rotation, origin], [excess])
     q = robot.random(np.random.default_rng(3), 300)
     palm = robot.palm(q)
     slack = 1e-9 + MODEL_ERROR.get(name, 0.0)
-    assert all(abs(float(asked(each[:3, :3], each[:3, 3]))) < slack for each in palm)
+    assert all(abs(float(excess_of(pose[:3, :3], pose[:3, 3]))) < slack for pose in palm)
     palm[:, :3, 3] += [4.0, 0.0, 0.0]
-    assert all(float(asked(each[:3, :3], each[:3, 3])) > 0.1 for each in palm)
-    assert not len(arms(found, palm[0], q[0]))
+    assert all(float(excess_of(pose[:3, :3], pose[:3, 3])) > 0.1 for pose in palm)
+    assert not len(arms(arm, palm[0], q[0]))
 
 
 def moved_screws(screws: Screws, rng: np.random.Generator) -> Screws:
@@ -201,8 +206,8 @@ def moved_screws(screws: Screws, rng: np.random.Generator) -> Screws:
         bent = Rotation.from_rotvec(angle * axes[i]).as_matrix()
         axes[i + 1 :] = axes[i + 1 :] @ bent.T
         points[i + 1 :] = (points[i + 1 :] - points[i]) @ bent.T + points[i]
-    along = rng.normal(size=(len(screws), 1))
-    return replace(screws, axes=axes, points=points + along * axes)
+    shifts = rng.normal(size=(len(screws), 1))
+    return replace(screws, axes=axes, points=points + shifts * axes)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -210,28 +215,28 @@ def test_neither_base_nor_zero_nor_the_names_of_points_matter(name):
     screws = arm_screws(robot_of(name).description)
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        moved = moved_screws(screws, rng)
-        found = family_of(moved)
-        assert found is not None
+        moved_arm = moved_screws(screws, rng)
+        arm = family_of(moved_arm)
+        assert arm is not None
         # Of two that both are exact, either may come first where a link is along an axis.
-        assert len(found.redundancy) == len(family(name).redundancy)
-        assert found.model_error == pytest.approx(family(name).model_error, abs=1e-9)
+        assert len(arm.redundancy) == len(family(name).redundancy)
+        assert arm.model_error == pytest.approx(family(name).model_error, abs=1e-9)
         angles = rng.uniform(-2, 2, len(screws))
-        palm = moved_by(moved, angles)
-        for each in arms(found, palm, angles):
+        palm = moved_by(moved_arm, angles)
+        for row in arms(arm, palm, angles):
             np.testing.assert_allclose(
-                moved_by(moved, each), palm, atol=1e-6 + MODEL_ERROR.get(name, 0.0)
+                moved_by(moved_arm, row), palm, atol=1e-6 + MODEL_ERROR.get(name, 0.0)
             )
 
 
 def test_what_is_nearly_of_a_family_is_solved_as_that_and_what_is_not_is_not():
     screws = arm_screws(robot_of("puma560").description)
-    for size, known in ((5e-4, True), (1e-2, True), (4e-2, False)):
+    for size, is_known in ((5e-4, True), (1e-2, True), (4e-2, False)):
         points = screws.points.copy()
         points[4] += size * np.cross(screws.axes[3], screws.axes[4])
-        found = family_of(replace(screws, points=points))
-        assert (found is not None and not found.is_iterative) == known
-        assert found is None or 1e-9 < found.model_error < 1e-2
+        arm = family_of(replace(screws, points=points))
+        assert (arm is not None and not arm.is_iterative) == is_known
+        assert arm is None or 1e-9 < arm.model_error < 1e-2
     points = screws.points.copy()
     points[3] += 0.05 * np.cross(screws.axes[3], screws.axes[4])
     points[5] += 0.07 * np.cross(screws.axes[5], screws.axes[4])
@@ -242,13 +247,13 @@ def test_what_is_nearly_of_a_family_is_solved_as_that_and_what_is_not_is_not():
 @pytest.mark.parametrize("name", ["panda", "puma560", "irb140", "ur5e", "xarm6"])
 def test_a_search_from_many_starts_finds_no_other_arm(name):
     """Least squares of SciPy on the product of exponentials, a swept joint held."""
-    screws, rng, seen, total = (
+    screws, rng, columns, total = (
         arm_screws(robot_of(name).description),
         np.random.default_rng(4),
         0,
         0,
     )
-    swept = [one.joint for one in family(name).redundancy]
+    swept = [redundancy.joint for redundancy in family(name).redundancy]
     free = [i for i in range(len(screws)) if i not in swept]
     for q in robot_of(name).random(rng, 2):
         arm = q[: len(screws)]
@@ -256,18 +261,18 @@ def test_a_search_from_many_starts_finds_no_other_arm(name):
         rows = arms(family(name), palm, arm)
 
         def left(x: Array, arm: Array = arm, palm: Array = palm) -> Array:
-            whole = arm.copy()
-            whole[free] = x
-            return (moved_by(screws, whole) - palm)[:3].ravel()
+            candidate = arm.copy()
+            candidate[free] = x
+            return (moved_by(screws, candidate) - palm)[:3].ravel()
 
         for start in rng.uniform(-np.pi, np.pi, (25, len(free))):
             ended = least_squares(left, start, xtol=1e-15)
             if np.abs(ended.fun).max() < 1e-9:
                 total += 1
-                found = np.insert(ended.x, swept, arm[swept]) if swept else ended.x
-                seen += apart(rows, found).min() < 1e-4
+                joint_row = np.insert(ended.x, swept, arm[swept]) if swept else ended.x
+                columns += differences(rows, joint_row).min() < 1e-4
     assert total > 15
-    assert seen == total
+    assert columns == total
 
 
 @pytest.mark.parametrize("name", SOLVED[1:])
@@ -276,56 +281,56 @@ def test_every_arm_of_another_library_is_among_ours(name):
     eaik = pytest.importorskip("eaik.IK_HP")
     robot, screws = robot_of(name), family(name).screws
     screws = screws.reversed() if screws.reverse else screws
-    swept = [one.joint for one in family(name).redundancy]
+    swept = [redundancy.joint for redundancy in family(name).redundancy]
     offsets = np.diff([np.zeros(3), *screws.points, screws.origin], axis=0)
     count = 0
     for q in robot.random(np.random.default_rng(5), 30):
         arm = q[: len(screws)]
-        other = eaik.HPRobot(screws.axes, offsets, [(j, float(arm[j])) for j in swept])
+        peer = eaik.HPRobot(screws.axes, offsets, [(j, float(arm[j])) for j in swept])
         target = robot.palm(q)
         target[:3, :3] = target[:3, :3] @ screws.rotation.T
-        answer = other.IK(target)
+        answer = peer.IK(target)
         theirs = np.asarray(answer.Q)[~np.asarray(answer.is_LS, dtype=bool)]
         if swept and theirs.size and theirs.shape[1] == len(arm) - 1:
             theirs = np.insert(theirs, swept, arm[swept], axis=1)
         rows = arms(family(name), robot.palm(q), arm, edge=1e-9)
         count += len(theirs)
-        assert all(apart(rows, each).min() < 1e-5 for each in theirs)
+        assert all(differences(rows, row).min() < 1e-5 for row in theirs)
     assert count > 60
 
 
 @pytest.mark.parametrize("name", OFFSET)
 def test_no_root_of_an_offset_wrist_is_lost(name):
     """Against Brent's method between the signs of a scan of 720 turns, branch by branch."""
-    robot, found = robot_of(name), family(name)
-    assert isinstance(found, OffsetWristArm)
-    assert np.linalg.norm(found.offset) == pytest.approx(OFFSET[name])
-    turns, condition = np.linspace(-np.pi, np.pi, 721), found._branch()
-    lost = total = 0
+    robot, family_arm = robot_of(name), family(name)
+    assert isinstance(family_arm, OffsetWristArm)
+    assert np.linalg.norm(family_arm.offset) == pytest.approx(OFFSET[name])
+    turns, condition = np.linspace(-np.pi, np.pi, 721), family_arm._branch()
+    lost_count = total = 0
     for q in robot.random(np.random.default_rng(8), 8):
-        palm, arm = robot.palm(q), q[: len(found.screws)]
-        rows = arms(found, palm, arm)
-        swept = arm[0] if found.redundancy else 0.0
-        rotation, origin, *_ = found._start()(swept, palm[:3, :3], palm[:3, 3])
+        palm, arm = robot.palm(q), q[: len(family_arm.screws)]
+        rows = arms(family_arm, palm, arm)
+        swept = arm[0] if family_arm.redundancy else 0.0
+        rotation, origin, *_ = family_arm._start()(swept, palm[:3, :3], palm[:3, 3])
         for signs in SIGNS:
 
-            def left(t: float, given: tuple = (rotation, origin), signs: tuple = signs) -> float:
-                return float(condition(*given, t, *signs)[2])
+            def left(t: float, pose: tuple = (rotation, origin), signs: tuple = signs) -> float:
+                return float(condition(*pose, t, *signs)[2])
 
             values = condition.map(len(turns))(rotation, origin, turns, *signs)[2]
             values = np.array(values).ravel()
             crossed = (values[1:] * values[:-1] < 0) & (np.abs(np.diff(values)) < 1)
             for i in np.flatnonzero(crossed):
                 t = brentq(left, turns[i], turns[i + 1], xtol=1e-14)
-                six, slack, rest = condition(rotation, origin, t, *signs)
+                six, slack, residual = condition(rotation, origin, t, *signs)
                 # Two arms near each other at the edge of reach may both be missed.
-                if float(slack) < 0.05 or abs(float(rest)) > 1e-9:
+                if float(slack) < 0.05 or abs(float(residual)) > 1e-9:
                     continue
-                whole = np.array(found._all_joints_function()(six, swept)).ravel()
+                full_arm = np.array(family_arm._all_joints_function()(six, swept)).ravel()
                 total += 1
-                lost += not len(rows) or apart(rows, whole).min() > 1e-6
+                lost_count += not len(rows) or differences(rows, full_arm).min() > 1e-6
     assert total > 15
-    assert lost == 0
+    assert lost_count == 0
 
 
 def srs_numbers(robot: ik.ArmHand):
@@ -334,31 +339,33 @@ def srs_numbers(robot: ik.ArmHand):
     assert arm is not None
     rotation, origin, sign = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("sign")
     lower, upper = ca.SX.sym("lower", 7), ca.SX.sym("upper", 7)
-    found = arm.breakpoints(Pose(rotation, origin), (sign,), lower, upper)
-    asked = ca.Function("breakpoints", [rotation, origin, sign, lower, upper], [found])
+    breakpoints = arm.breakpoints(Pose(rotation, origin), (sign,), lower, upper)
+    breakpoints_of = ca.Function(
+        "breakpoints", [rotation, origin, sign, lower, upper], [breakpoints]
+    )
     return lambda palm, sign, *bounds: np.array(
-        asked(palm[:3, :3], palm[:3, 3], sign, *bounds)
+        breakpoints_of(palm[:3, :3], palm[:3, 3], sign, *bounds)
     ).ravel()
 
 
 def at_swivels(robot: ik.ArmHand, palm: Array, swivels: Array) -> Array:
     """(8 k, 7) all arms of an S-R-S arm at swivels (k,)."""
-    found = arm_family(robot.description)
-    assert found is not None
-    rows = [function(found)(palm[:3, :3], palm[:3, 3], psi)[0] for psi in swivels]
-    return np.concatenate([np.array(each) for each in rows])
+    arm = arm_family(robot.description)
+    assert arm is not None
+    rows = [function(arm)(palm[:3, :3], palm[:3, 3], psi)[0] for psi in swivels]
+    return np.concatenate([np.array(row) for row in rows])
 
 
 @pytest.mark.slow
 def test_an_srs_arm_is_found_again_at_the_swivel_where_a_joint_has_its_value(robot, rng):
     """And where a bound is met at all, a joint stands at it at a breakpoint."""
-    asked, tested = srs_numbers(robot), 0
+    numbers_of, tested = srs_numbers(robot), 0
     for q in robot.random(rng, 10):
         palm, sign, arm = robot.palm(q), np.sign(q[3]), q[:7]
-        for swivels in asked(palm, sign, arm, arm).reshape(6, 4):
-            assert apart(at_swivels(robot, palm, swivels), arm).min() < 1e-7
+        for swivels in numbers_of(palm, sign, arm, arm).reshape(6, 4):
+            assert differences(at_swivels(robot, palm, swivels), arm).min() < 1e-7
         ends = robot.lower[:7], robot.upper[:7]
-        swivels = asked(palm, sign, *ends).reshape(6, 2, 2)
+        swivels = numbers_of(palm, sign, *ends).reshape(6, 2, 2)
         for joint, of_joint in zip((0, 1, 2, 4, 5, 6), swivels, strict=True):
             for end, at in zip(ends, of_joint, strict=True):
                 angles = at_swivels(robot, palm, at)[:, joint]
@@ -373,10 +380,10 @@ def test_reach_follows_the_bounds_of_an_srs_elbow(robot):
     arm = srs_arm(robot.description)
     assert arm is not None
     for lower, upper in ((-2.0, 2.0), (0.3, 2.0), (-2.0, -0.4), (0.7, 0.7), (-1e3, 1e3)):
-        near, far = (float(value) for value in arm.reach(ca.SX(lower), ca.SX(upper)))
+        lowest, highest = (float(value) for value in arm.reach(ca.SX(lower), ca.SX(upper)))
         bends = np.linspace(max(lower, -np.pi), min(upper, np.pi), 2001)
         distance = np.linalg.norm([0.4 + 0.39 * np.cos(bends), 0.39 * np.sin(bends)], axis=0)
-        np.testing.assert_allclose([near, far], [distance.min(), distance.max()], atol=1e-6)
+        np.testing.assert_allclose([lowest, highest], [distance.min(), distance.max()], atol=1e-6)
 
 
 @settings(max_examples=12)
@@ -393,11 +400,11 @@ def test_srs_arms_with_other_links_and_mounts(heights, shift, turn, seed):
     q = robot.random(rng, 1)[0]
     # At a straight elbow half the digits are lost, in any method.
     q[3] = np.copysign(max(abs(q[3]), 0.05), q[3])
-    found = at_swivels(robot, robot.palm(q), rng.uniform(-3, 3, 2))
-    whole = np.hstack([found, np.tile(q[7:], (len(found), 1))])
-    assert len(np.unique(np.round(found, 6), axis=0)) == len(found)
-    expected = np.broadcast_to(robot.palm(q), (len(found), 4, 4))
-    np.testing.assert_allclose(robot.palm(whole), expected, atol=1e-10)
+    rows = at_swivels(robot, robot.palm(q), rng.uniform(-3, 3, 2))
+    full_q = np.hstack([rows, np.tile(q[7:], (len(rows), 1))])
+    assert len(np.unique(np.round(rows, 6), axis=0)) == len(rows)
+    expected = np.broadcast_to(robot.palm(q), (len(rows), 4, 4))
+    np.testing.assert_allclose(robot.palm(full_q), expected, atol=1e-10)
 
 
 def test_what_is_no_srs_arm_is_not_taken_for_one(tmp_path, own_robot, coupled_robot):
@@ -436,7 +443,7 @@ class Arm:
 
     def palms(self, seed, count):
         q = self.robot.random(np.random.default_rng(seed), count)
-        return [(self.robot.palm(one), one[self.columns]) for one in q]
+        return [(self.robot.palm(row), row[self.columns]) for row in q]
 
     def margin(self, arms):
         return np.minimum(arms - self.bounds[0], self.bounds[1] - arms).min(axis=-1)
@@ -458,29 +465,34 @@ def test_the_stretches_are_all_that_is_allowed_and_no_more(name):
     """Against a scan of the whole redundancy, a branch at a time."""
     arm, inside_anywhere = arm_of(name), 0
     scan = np.linspace(*arm.range, 700)[1:-1] + 1e-4
-    for palm, own in arm.palms(1, 3):
-        found = arm.branches.find(palm, *arm.bounds)
-        assert found
+    for palm, own_angles in arm.palms(1, 3):
+        branches = arm.branches.find(palm, *arm.bounds)
+        assert branches
         margins = arm.branches._limit_margins(palm, scan, *arm.bounds)
         for kind in BENDS:
-            of_kind = [b.swivel for b in found if (b.shoulder, b.elbow, b.wrist) == kind]
+            of_kind = [b.swivel for b in branches if (b.shoulder, b.elbow, b.wrist) == kind]
             arms = arm.branches.arms(palm, ik.solve.ArmBranch(*kind, arm.range), scan)
             row = np.abs(
                 arm.branches._closed_form(palm[:3, :3], palm[:3, 3], scan)[0] - arms[:, None]
             )
             (row,) = np.flatnonzero(row.max(axis=(0, 2)) == 0)
-            inside = np.any([arm.contains(b, scan) for b in of_kind] or [scan > 1e9], axis=0)
-            np.testing.assert_array_equal(inside, margins[:, row] >= 0)
-            inside_anywhere += int(inside.sum())
+            in_branch = np.any([arm.contains(b, scan) for b in of_kind] or [scan > 1e9], axis=0)
+            np.testing.assert_array_equal(in_branch, margins[:, row] >= 0)
+            inside_anywhere += int(in_branch.sum())
         # The ends are where something is at a limit, or where the arm is stretched out.
-        for branch in found:
+        for branch in branches:
             ends = arm.branches.arms(palm, branch, np.array(branch.swivel))
             assert (arm.margin(ends) > -1e-6).all()
             if arm.around and branch.swivel[1] - branch.swivel[0] < 2 * np.pi - 1e-9:
                 np.testing.assert_allclose(arm.margin(ends), 0, atol=1e-7)
         # The configuration itself, turned by whole turns, is one of them.
-        near = [arm.branches.arms(palm, b, np.linspace(*b.swivel, 2000)) for b in found]
-        off = min(np.abs(np.angle(np.exp(1j * (arms - own)))).max(axis=1).min() for arms in near)
+        arms_of_branches = [
+            arm.branches.arms(palm, b, np.linspace(*b.swivel, 2000)) for b in branches
+        ]
+        off = min(
+            np.abs(np.angle(np.exp(1j * (arms - own_angles)))).max(axis=1).min()
+            for arms in arms_of_branches
+        )
         assert off < 0.02 or not arm.branches.family.is_exact
     assert inside_anywhere > 0
 
@@ -489,9 +501,9 @@ def test_the_stretches_are_all_that_is_allowed_and_no_more(name):
 def test_an_arm_of_six_joints_has_single_branches(name):
     """The arm that a palm pose was made with, turned by whole turns, is among them."""
     arm = arm_of(name)
-    for palm, own in arm.palms(2, 8):
-        found = arm.branches.find(palm, *arm.bounds)
-        assert len(set(found)) == len(found)
-        assert all(branch.swivel is None for branch in found)
-        arms = [arm.branches.arms(palm, branch, np.zeros(1))[0] for branch in found]
-        assert min(np.abs(np.angle(np.exp(1j * (a - own)))).max() for a in arms) < 1e-6
+    for palm, own_angles in arm.palms(2, 8):
+        branches = arm.branches.find(palm, *arm.bounds)
+        assert len(set(branches)) == len(branches)
+        assert all(branch.swivel is None for branch in branches)
+        arms = [arm.branches.arms(palm, branch, np.zeros(1))[0] for branch in branches]
+        assert min(np.abs(np.angle(np.exp(1j * (a - own_angles)))).max() for a in arms) < 1e-6

@@ -37,7 +37,9 @@ def targets(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.fixture(scope="module")
-def whole(targets: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+def unbroken_answers(
+    targets: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, np.ndarray]:
     """The answers of a batch in one go."""
     out = tmp_path_factory.mktemp("whole") / "out.npz"
     assert main(["batch", str(targets), *ROBOT, "--out", str(out)]) == 1
@@ -50,10 +52,10 @@ def answers(path: Path) -> dict[str, np.ndarray]:
         return {name: arrays[name] for name in arrays.files if name not in ("time", "row")}
 
 
-def same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
-    assert found.keys() == expected.keys()
+def assert_same_arrays(actual: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    assert actual.keys() == expected.keys()
     for name, array in expected.items():
-        np.testing.assert_array_equal(found[name], array, err_msg=name)
+        np.testing.assert_array_equal(actual[name], array, err_msg=name)
 
 
 def begun(*words: object) -> subprocess.Popen[str]:
@@ -68,20 +70,22 @@ def begun(*words: object) -> subprocess.Popen[str]:
     )
 
 
-def wait_for_parts(folder: Path, least: int, process: subprocess.Popen[str]) -> list[Path]:
+def wait_for_parts(folder: Path, minimum: int, process: subprocess.Popen[str]) -> list[Path]:
     """Wait until so many parts are there, or the process has ended."""
     end = time.monotonic() + 6000
     while time.monotonic() < end:
         parts = sorted(folder.glob("part-*.npz"))
-        if len(parts) >= least or process.poll() is not None:
+        if len(parts) >= minimum or process.poll() is not None:
             return parts
         time.sleep(0.01)
-    raise AssertionError(f"{folder}: fewer than {least} parts")
+    raise AssertionError(f"{folder}: fewer than {minimum} parts")
 
 
 @pytest.mark.slow
 @POSIX
-def test_killed_and_taken_up_again(targets: Path, whole: dict[str, np.ndarray], tmp_path: Path):
+def test_killed_and_taken_up_again(
+    targets: Path, unbroken_answers: dict[str, np.ndarray], tmp_path: Path
+):
     """The client is killed; what it had finished is kept as it is, and the rest is done."""
     out, folder = tmp_path / "out.npz", tmp_path / "out.npz.parts"
     words = (targets, *ROBOT, *PARTS, "--resume", "--out", out, "--log", tmp_path / "logs")
@@ -89,21 +93,21 @@ def test_killed_and_taken_up_again(targets: Path, whole: dict[str, np.ndarray], 
     wait_for_parts(folder, 5, process)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
-    kept = {path: path.stat().st_mtime_ns for path in folder.glob("part-*.npz")}
-    assert 5 <= len(kept) < COUNT // SIZE
+    stamps = {path: path.stat().st_mtime_ns for path in folder.glob("part-*.npz")}
+    assert 5 <= len(stamps) < COUNT // SIZE
     assert not out.exists()
-    first = next(iter(kept))
+    first = next(iter(stamps))
     first.unlink()  # as if it had been lost
-    before = {path: stamp for path, stamp in kept.items() if path != first}
+    kept_stamps = {path: stamp for path, stamp in stamps.items() if path != first}
 
     process = begun(*words)
-    wait_for_parts(folder, len(kept) + 2, process)
+    wait_for_parts(folder, len(stamps) + 2, process)
     with contextlib.suppress(FileNotFoundError):  # it is through already
-        assert {path: path.stat().st_mtime_ns for path in before} == before
+        assert {path: path.stat().st_mtime_ns for path in kept_stamps} == kept_stamps
     report, error = process.communicate(timeout=300)
     assert process.returncode == 1, error
     assert f"{COUNT - 1} of {COUNT}" in report
-    same(answers(out), whole)
+    assert_same_arrays(answers(out), unbroken_answers)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["logs", "out.npz"]
     log = ik.logs.open(tmp_path / "logs")
     assert len(log.solves()) == COUNT - 1
@@ -148,7 +152,7 @@ def cluster() -> Iterator[tuple[str, subprocess.Popen[str], list[subprocess.Pope
 @pytest.mark.slow
 @POSIX
 def test_a_cluster_that_loses_a_worker_then_its_scheduler(
-    cluster, targets: Path, whole: dict[str, np.ndarray], tmp_path: Path
+    cluster, targets: Path, unbroken_answers: dict[str, np.ndarray], tmp_path: Path
 ):
     address, scheduler, workers = cluster
     out = tmp_path / "out"
@@ -156,8 +160,8 @@ def test_a_cluster_that_loses_a_worker_then_its_scheduler(
     process = begun(*words)
     wait_for_parts(out, 5, process)
     workers[0].kill()
-    there = len(wait_for_parts(out, 12, process))
-    assert there >= 12
+    part_count = len(wait_for_parts(out, 12, process))
+    assert part_count >= 12
     scheduler.kill()
     report, error = process.communicate(timeout=6000)
     if process.returncode == 2:
@@ -171,12 +175,12 @@ def test_a_cluster_that_loses_a_worker_then_its_scheduler(
     assert main(["batch", str(targets), *ROBOT, *PARTS, "--resume", "--out", str(out)]) == 1
     parts = [answers(path) for path in sorted(out.glob("part-*.npz"))]
     assert len(parts) == COUNT // SIZE
-    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    same(found, whole)
+    joined_answers = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    assert_same_arrays(joined_answers, unbroken_answers)
 
 
 def test_a_folder_of_files_and_a_table(
-    targets: Path, robot: ik.ArmHand, whole: dict[str, np.ndarray], tmp_path: Path
+    targets: Path, robot: ik.ArmHand, unbroken_answers: dict[str, np.ndarray], tmp_path: Path
 ):
     """A Parquet file and an npz file, one after the other."""
     with np.load(targets) as arrays:
@@ -193,7 +197,9 @@ def test_a_folder_of_files_and_a_table(
     np.savez(folder / "b.npz", points=points[130:], normals=normals[130:])
     out = tmp_path / "out.npz"
     assert main(["batch", str(folder), *ROBOT, *PARTS, "--out", str(out)]) == 0
-    same(answers(out), {name: array[:250] for name, array in whole.items()})
+    assert_same_arrays(
+        answers(out), {name: array[:250] for name, array in unbroken_answers.items()}
+    )
 
 
 Change = Callable[[Path], list[str]]
@@ -275,7 +281,9 @@ def test_an_extra_that_is_missing_leaves_nothing(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_answers_are_an_npz_a_table_or_a_folder(targets: Path, tmp_path: Path, capsys, whole):
+def test_answers_are_an_npz_a_table_or_a_folder(
+    targets: Path, tmp_path: Path, capsys, unbroken_answers
+):
     assert main(["batch", str(targets), *ROBOT, "--out", str(tmp_path / "out.csv")]) == 2
     error = capsys.readouterr().err
     assert "out.csv', expected OUT.npz" in error
@@ -283,7 +291,7 @@ def test_answers_are_an_npz_a_table_or_a_folder(targets: Path, tmp_path: Path, c
     assert not list(tmp_path.iterdir())
     out = tmp_path / "out.parquet"
     assert main(["batch", str(targets), *ROBOT, "--out", str(out)]) == 1
-    np.testing.assert_array_equal(pl.read_parquet(out)["success"], whole["success"])
+    np.testing.assert_array_equal(pl.read_parquet(out)["success"], unbroken_answers["success"])
 
 
 @pytest.mark.slow
@@ -298,8 +306,8 @@ def test_terminated_leaves_nothing_half_written(
     while process.poll() is None and not list(tmp_path.glob(wait_for)):
         time.sleep(0.01)
     process.terminate()
-    said = process.communicate(timeout=6000)
-    assert process.returncode == 143, said
+    output = process.communicate(timeout=6000)
+    assert process.returncode == 143, output
     parts = sorted((tmp_path / "out.npz.parts").glob("part-*.npz"))
     left = {path for path in tmp_path.rglob("*") if path.is_file()}
     written = set(logs.glob("part-*.mcap"))

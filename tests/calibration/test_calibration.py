@@ -32,7 +32,7 @@ def index(ar10) -> HandModel:
 
 
 @pytest.fixture(scope="module")
-def found(index) -> Calibration:
+def estimate(index) -> Calibration:
     """From 60 poses, every tenth an outlier, of a hand that is not the described one."""
     rng = np.random.default_rng(3)
     data = simulate(index, true_values(index, rng), "index", 60, rng, outliers=0.1)
@@ -50,8 +50,8 @@ def test_the_described_numbers_give_the_described_robot(ar10, index, rng):
     finger = ar10.fingers.index("index")
     np.testing.assert_allclose(point(poses), points[:, finger], atol=1e-14)
     normal = ca.DM(ar10.description.finger("index").normal.tolist())
-    turned = [np.array(dq.rotate(ca.DM(pose), normal)).ravel() for pose in poses]
-    np.testing.assert_allclose(turned, normals[:, finger], atol=1e-14)
+    rotated = [np.array(dq.rotate(ca.DM(pose), normal)).ravel() for pose in poses]
+    np.testing.assert_allclose(rotated, normals[:, finger], atol=1e-14)
 
 
 def test_jacobian_by_central_differences(index, ar10, rng):
@@ -91,7 +91,7 @@ def test_exact_data_are_explained_exactly(index, rng):
 @pytest.mark.parametrize("loss", LOSSES)
 def test_error_bars_are_true(loss, index):
     """About 95 % of the 95 % intervals hold the true number, outliers or not."""
-    inside, noise = [], []
+    within_bars, noise = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
         truth = true_values(index, rng)
@@ -100,9 +100,9 @@ def test_error_bars_are_true(loss, index):
             index, simulate(index, truth, "index", 40, rng, outliers=outliers), loss=loss
         )
         assert result.converged
-        inside.append(np.abs(result.values - truth) <= result.interval)
+        within_bars.append(np.abs(result.values - truth) <= result.interval)
         noise.append(result.noise)
-    assert 0.88 < np.mean(inside) < 0.99
+    assert 0.88 < np.mean(within_bars) < 0.99
     assert np.median(noise, axis=0) == pytest.approx([2e-4, np.deg2rad(0.5)], rel=0.25)
 
 
@@ -143,9 +143,9 @@ def test_data_cannot_tell_the_size_of_a_four_bar(ar10, rng):
         # A triangle does know its size: the slider is measured in metres.
         assert result.learned[names.index(f"{joint}.c")] > 0.5
     growth /= np.linalg.norm(growth)
-    lost = result.directions[result.singular_values < 1e-6 * result.singular_values[0]]
-    assert len(lost) >= 1
-    assert np.linalg.norm(lost @ growth) == pytest.approx(1, abs=1e-6)
+    unobservable = result.directions[result.singular_values < 1e-6 * result.singular_values[0]]
+    assert len(unobservable) >= 1
+    assert np.linalg.norm(unobservable @ growth) == pytest.approx(1, abs=1e-6)
     assert result.unknown_directions >= 1
     worst = result.unidentified()[0][1]
     assert any(name.startswith("index_distal") for name in worst)
@@ -160,14 +160,14 @@ def test_points_alone_are_enough_for_a_smaller_estimate(index, rng):
     assert np.isnan(result.noise[1])
     assert np.isnan(result.after[:, 1]).all()
     assert np.median(result.after[:, 0]) < 0.5 * np.median(result.before[:, 0])
-    whole = calibrate(index, data)
-    assert result.deviation.sum() > whole.deviation.sum()
+    with_frames = calibrate(index, data)
+    assert result.deviation.sum() > with_frames.deviation.sum()
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_few_poses_leave_the_priors_and_the_assumed_noise(count, index):
     """No overconfidence: with too few data to show their noise, the assumed one stands."""
-    inside = []
+    within_bars = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
         truth = true_values(index, rng)
@@ -175,58 +175,62 @@ def test_few_poses_leave_the_priors_and_the_assumed_noise(count, index):
         result = calibrate(index, data, sigma_position=2e-4, sigma_angle=np.deg2rad(0.5))
         assert result.converged
         assert not result.noise_estimated or count == 5
-        inside.append(np.abs(result.values - truth) <= result.interval)
-    assert 0.9 < np.mean(inside) < 0.99
+        within_bars.append(np.abs(result.values - truth) <= result.interval)
+    assert 0.9 < np.mean(within_bars) < 0.99
 
 
 def test_bounds_hold(index, rng):
     """Data of a hand far off: no number leaves three prior deviations."""
-    far = index.nominal + 2.9 * index.prior * np.sign(rng.standard_normal(len(index.prior)))
-    result = calibrate(index, simulate(index, far, "index", 60, rng))
+    edge_values = index.nominal + 2.9 * index.prior * np.sign(rng.standard_normal(len(index.prior)))
+    result = calibrate(index, simulate(index, edge_values, "index", 60, rng))
     x = (result.values - index.nominal) / index.prior
     assert np.abs(x).max() <= 3 + 1e-9
     tight = HandModel(
         index.robot, hand_parameters(index.robot, ["index"], priors=Priors(1e-5, 1e-5, 1e-5, 1e-5))
     )
-    held = calibrate(tight, simulate(index, far, "index", 60, rng))
-    assert np.abs((held.values - tight.nominal) / tight.prior).max() <= 3 + 1e-9
+    estimate = calibrate(tight, simulate(index, edge_values, "index", 60, rng))
+    assert np.abs((estimate.values - tight.nominal) / tight.prior).max() <= 3 + 1e-9
 
 
 @pytest.mark.parametrize("name", ["ar10", "baxter_ar10"])
-def test_the_written_description_is_the_estimated_hand(name, index, found, tmp_path, rng):
+def test_the_written_description_is_the_estimated_hand(name, index, estimate, tmp_path, rng):
     path = tmp_path / "calibrated.yaml"
-    write_description(found, name, path, "poses.csv")
+    write_description(estimate, name, path, "poses.csv")
     robot, described = ik.load_robot(path), ik.load_robot(name)
     assert robot.actuators == described.actuators
     assert robot.fingers == described.fingers
-    model = HandModel(described.description, found.parameters, compiled=False)
+    model = HandModel(described.description, estimate.parameters, compiled=False)
     q = robot.random(rng, 10)
     points, _ = robot.contacts(q)
-    expected = point(model.poses("index", q, found.values))
+    expected = point(model.poses("index", q, estimate.values))
     np.testing.assert_allclose(points[:, robot.fingers.index("index")], expected, atol=1e-12)
-    others = [i for i, finger in enumerate(robot.fingers) if finger != "index"]
-    np.testing.assert_array_equal(points[:, others], described.contacts(q)[0][:, others])
+    other_fingers = [i for i, finger in enumerate(robot.fingers) if finger != "index"]
+    np.testing.assert_array_equal(
+        points[:, other_fingers], described.contacts(q)[0][:, other_fingers]
+    )
     # The strokes are what limits the calibrated joints, too.
-    moved = robot.joints(np.linspace(robot.lower, robot.upper, 50))
+    joints = robot.joints(np.linspace(robot.lower, robot.upper, 50))
     for joint in robot.description.movable:
         if joint.name.startswith("index"):
-            assert joint.lower <= moved[joint.name].min()
-            assert moved[joint.name].max() <= joint.upper
+            assert joint.lower <= joints[joint.name].min()
+            assert joints[joint.name].max() <= joint.upper
     assert "poses.csv" in robot.description.sources["calibration"]
 
 
 def test_a_file_of_measurements_round_trip(index, ar10, tmp_path, rng):
     data = simulate(index, index.nominal, "index", 5, rng)
-    seen = Measurements(data.fingers, data.q, data.poses, np.array([1, 1, 0, 1, 0], dtype=bool))
-    write_measurements(seen, ar10.description, tmp_path / "poses.csv")
+    measurements = Measurements(
+        data.fingers, data.q, data.poses, np.array([1, 1, 0, 1, 0], dtype=bool)
+    )
+    write_measurements(measurements, ar10.description, tmp_path / "poses.csv")
     read = read_measurements(tmp_path / "poses.csv", ar10.description)
-    assert read.fingers == seen.fingers
-    np.testing.assert_array_equal(read.turned, seen.turned)
-    np.testing.assert_allclose(point(read.poses), point(seen.poses), atol=1e-15)
-    np.testing.assert_allclose(read.poses[0], seen.poses[0], atol=1e-14)
+    assert read.fingers == measurements.fingers
+    np.testing.assert_array_equal(read.turned, measurements.turned)
+    np.testing.assert_allclose(point(read.poses), point(measurements.poses), atol=1e-15)
+    np.testing.assert_allclose(read.poses[0], measurements.poses[0], atol=1e-14)
     # Actuators that do not move the finger are at home, whatever the file says.
     columns = [ar10.actuators.index(f"index_{part}_slider") for part in ("proximal", "middle")]
-    np.testing.assert_array_equal(read.q[:, columns], seen.q[:, columns])
+    np.testing.assert_array_equal(read.q[:, columns], measurements.q[:, columns])
 
 
 def test_bad_arguments(ar10, index, rng):

@@ -22,8 +22,8 @@ def run(capsys: pytest.CaptureFixture[str]) -> Command:
 
     def call(*words: object) -> Run:
         code = main([str(word) for word in words])
-        seen = capsys.readouterr()
-        return Run(code, seen.out, seen.err)
+        captured = capsys.readouterr()
+        return Run(code, captured.out, captured.err)
 
     return call
 
@@ -65,11 +65,11 @@ def grasp_file(tmp_path: Path, contacts: dict[str, Any]) -> Callable[..., Path]:
 @pytest.fixture
 def far_away(grasp_file: Callable[..., Path], contacts: dict[str, Any]) -> Path:
     """A valid grasp file that no one can reach."""
-    moved = {
+    far_contacts = {
         name: {"point": [x + 5.0 for x in contact["point"]], "normal": contact["normal"]}
         for name, contact in contacts.items()
     }
-    return grasp_file("far_away.yaml", contacts=moved)
+    return grasp_file("far_away.yaml", contacts=far_contacts)
 
 
 @pytest.fixture

@@ -112,9 +112,9 @@ def test_blocks_and_jobs_do_not_show(
         rows = np.delete(np.arange(count), count // 2)
         assert [solve["solve_id"] for solve in solves] == rows.tolist()
         assert [solve["status"] for solve in solves] == answers[0]["status"][rows].tolist()
-    for other in answers[1:]:
+    for answer in answers[1:]:
         for key, value in answers[0].items():
-            np.testing.assert_array_equal(other[key], value, err_msg=key)
+            np.testing.assert_array_equal(answer[key], value, err_msg=key)
 
 
 def test_diagnoses_are_written_if_asked_for(
@@ -180,12 +180,12 @@ def test_targets_in_the_frame_of_an_object(
     pose = ["0.01", "0", "-0.02", "0", "0", "0.1"]
     done = run("batch", target_file(), *ROBOT, "--out", out, "--object-pose", *pose)
     assert done.exit == 0
-    with np.load(target_file()) as data, np.load(out) as found:
+    with np.load(target_file()) as data, np.load(out) as answers:
         c, s = np.cos(0.1), np.sin(0.1)
         turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-        points, normals = robot.contacts(found["q"])
-        away = points - (data["points"] @ turn + [0.01, 0, -0.02])
-        assert np.linalg.norm(away, axis=-1).max() < ik.Tolerance().position
+        points, normals = robot.contacts(answers["q"])
+        offsets = points - (data["points"] @ turn + [0.01, 0, -0.02])
+        assert np.linalg.norm(offsets, axis=-1).max() < ik.Tolerance().position
         assert (normals * (data["normals"] @ turn)).sum(axis=-1).min() > np.cos(
             ik.Tolerance().angle
         )

@@ -45,24 +45,24 @@ def test_the_best_are_written(run: Command, candidates: Path, tmp_path: Path) ->
     done = run(*words, "--limit", "3", "--per-candidate", "2").fine()
     assert done.out.startswith("FOUND")
     assert "collision not checked" in done.out
-    found = json.loads(out.read_text())
-    assert found["candidates"] == 4
-    assert len(found["ranked"]) == 3
-    scores = [one["score"] for one in found["ranked"]]
+    report = json.loads(out.read_text())
+    assert report["candidates"] == 4
+    assert len(report["ranked"]) == 3
+    scores = [item["score"] for item in report["ranked"]]
     assert scores == sorted(scores, reverse=True)
-    best = found["ranked"][0]
+    best = report["ranked"][0]
     robot = ik.load_robot(ROBOT)
     grasps = [ik.Grasp({n: ik.Contact(**c) for n, c in entry(a)["contacts"].items()})
               for a in (0.0, 1.5, 3.0, 4.5)]  # fmt: skip
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]]
     pose[:3, 3] = [-0.82, 0.127, 0.41]
-    asked = grasps[best["candidate"]].at(pose).arrays(robot.fingers)
-    position, _ = robot.errors(best["solution"]["q"], *asked)
+    points_of_best = grasps[best["candidate"]].at(pose).arrays(robot.fingers)
+    position, _ = robot.errors(best["solution"]["q"], *points_of_best)
     assert (position <= 5e-3).all()
     free = run(*words, "--scene", "table", "--prefer", "clearance")
     assert free.exit == 0
-    assert all(one["solution"]["clearance"] >= 0 for one in json.loads(out.read_text())["ranked"])
+    assert all(item["solution"]["clearance"] >= 0 for item in json.loads(out.read_text())["ranked"])
 
 
 def test_folders_and_arrays_hold_candidates_too(
@@ -71,32 +71,32 @@ def test_folders_and_arrays_hold_candidates_too(
     out, folder = tmp_path / "ranked.json", tmp_path / "grasps"
     words = ("--robot", ROBOT, *PLACE, "--limit", "5", "--out", out)
     assert run("choose", candidates, *words).exit == 0
-    scores = [one["score"] for one in json.loads(out.read_text())["ranked"]]
+    scores = [item["score"] for item in json.loads(out.read_text())["ranked"]]
     folder.mkdir()
     arrays = []
-    for i, one in enumerate(yaml.safe_load(candidates.read_text())["candidates"]):
+    for i, item in enumerate(yaml.safe_load(candidates.read_text())["candidates"]):
         path = folder / f"grasp_{i}.yaml"
-        path.write_text(yaml.safe_dump(one | {"object": {"name": "cup"}}))
+        path.write_text(yaml.safe_dump(item | {"object": {"name": "cup"}}))
         arrays.append(ik.load_grasp(path).arrays(ik.load_robot(ROBOT).fingers))
     targets = tmp_path / "targets.npz"
     points, normals = (np.stack(both) for both in zip(*arrays, strict=True))
     np.savez(targets, points=points, normals=normals)
-    for other in (folder, targets):
-        assert run("choose", other, *words).exit == 0
-        found = [one["score"] for one in json.loads(out.read_text())["ranked"]]
-        np.testing.assert_allclose(found, scores, atol=1e-9)
+    for source in (folder, targets):
+        assert run("choose", source, *words).exit == 0
+        scores_again = [item["score"] for item in json.loads(out.read_text())["ranked"]]
+        np.testing.assert_allclose(scores_again, scores, atol=1e-9)
 
 
 def test_none_found_counts_the_reasons(run: Command, candidates: Path, tmp_path: Path) -> None:
     out = tmp_path / "ranked.json"
-    far = ("--object-pose", "5", "0", "0", "0", "0", "0")
-    done = run("choose", candidates, "--robot", ROBOT, *far, "--out", out)
+    far_pose = ("--object-pose", "5", "0", "0", "0", "0", "0")
+    done = run("choose", candidates, "--robot", ROBOT, *far_pose, "--out", out)
     assert done.exit == 1
     assert done.out.startswith("NONE FOUND")
     assert "4 have none: STALLED" in done.out
-    found = json.loads(out.read_text())
-    assert found["ranked"] == []
-    assert sum(found["failures"].values()) == 4
+    report = json.loads(out.read_text())
+    assert report["ranked"] == []
+    assert sum(report["failures"].values()) == 4
 
 
 def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
@@ -106,17 +106,17 @@ def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
     palms, motors = robot.palm(q), robot.actuators[7:]
     rows = ["x,y,z,roll,pitch,yaw," + ",".join(motors)]
     for palm, row in zip(palms, q, strict=True):
-        turned = Rotation.from_matrix(palm[:3, :3]).as_euler("xyz")
-        rows.append(",".join(repr(float(v)) for v in (*palm[:3, 3], *turned, *row[7:])))
+        angles = Rotation.from_matrix(palm[:3, :3]).as_euler("xyz")
+        rows.append(",".join(repr(float(v)) for v in (*palm[:3, 3], *angles, *row[7:])))
     path = tmp_path / "grasps.csv"
     path.write_text("\n".join(rows))
     words = ("choose", path, "--robot", ROBOT, "--out", out)
     run(*words, "--limit", "3", "--per-candidate", "2").fine()
-    found = json.loads(out.read_text())
-    assert (found["candidates"], found["answered"]) == (8, 8)
-    for one in found["ranked"]:
-        assert one["solution"]["palm"]["ok"]
-        assert one["solution"]["q"][7:] == pytest.approx(q[one["candidate"]][7:].tolist())
+    report = json.loads(out.read_text())
+    assert (report["candidates"], report["answered"]) == (8, 8)
+    for item in report["ranked"]:
+        assert item["solution"]["palm"]["ok"]
+        assert item["solution"]["q"][7:] == pytest.approx(q[item["candidate"]][7:].tolist())
     assert "layout" in run(*words, "--layout", "mine").error
     assert "bodex" in run(*words, "--layout", "bodex").error
     path.write_text(rows[0].replace("bh_spread", "spread") + "\n" + rows[1])

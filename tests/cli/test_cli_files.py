@@ -78,10 +78,10 @@ def test_special_files_are_left_alone(run: Command, grasp_file: GraspFile) -> No
 def test_outputs_do_not_overwrite_each_other_or_the_input(
     run: Command, grasp_file: GraspFile, tmp_path: Path
 ) -> None:
-    grasp, same = grasp_file(), tmp_path / "same"
+    grasp, same_path = grasp_file(), tmp_path / "same"
     (tmp_path / "link").symlink_to("same")
-    error = run("solve", grasp, "--out", same, "--log", tmp_path / "link").error
-    assert error.startswith(f"{same}: --out: ")
+    error = run("solve", grasp, "--out", same_path, "--log", tmp_path / "link").error
+    assert error.startswith(f"{same_path}: --out: ")
     assert "--log" in error
     (tmp_path / "input.json").hardlink_to(grasp)
     error = run("solve", grasp, "--out", tmp_path / "input.json").error
@@ -116,10 +116,10 @@ def test_disk_full_on_the_output(
     out = tmp_path / "solved.npz"
     words = ("batch", targets, "--robot", "kuka_lwr_barrett", *FAST, "--out", out)
     assert run(*words).exit == 0
-    before = out.read_bytes()
+    data_before = out.read_bytes()
     error = run_process(*words, preexec_fn=_at_most(2_000)).error
     assert error == f"{out}: --out: cannot be written: File too large"
-    assert out.read_bytes() == before
+    assert out.read_bytes() == data_before
     assert len(list(tmp_path.iterdir())) == 2
 
 

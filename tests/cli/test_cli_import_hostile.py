@@ -59,7 +59,10 @@ ATTACKS = {
 
 @pytest.mark.parametrize(
     ("attack", "name"),
-    [*((one, name) for one in ATTACKS for name in ("x.urdf", "x.xacro")), ("classes", "asked")],
+    [
+        *((attack_name, name) for attack_name in ATTACKS for name in ("x.urdf", "x.xacro")),
+        ("classes", "asked"),
+    ],
 )
 def test_a_file_runs_no_code_and_reads_no_other(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, attack: str, name: str
@@ -112,8 +115,10 @@ def test_macros_are_expanded_where_they_are_asked_for(run: Command, tmp_path: Pa
     assert "import it with --xacro" in run("import", robot(path, head), "--out", out).error
     robot(path, head, "${0.05 * 2}")
     assert run("import", path, "--xacro", "--out", out, "--check").exit == 0
-    found = ik.load_robot(out)  # which goes by what stands in the description
-    assert found.links(found.home)["left_1"][2, 3] == pytest.approx(0.1, abs=1e-15)
+    imported_robot = ik.load_robot(out)  # which goes by what stands in the description
+    assert imported_robot.links(imported_robot.home)["left_1"][2, 3] == pytest.approx(
+        0.1, abs=1e-15
+    )
     assert "  xacro: true\n" in out.read_text()
 
 
@@ -132,11 +137,13 @@ def test_what_robots_are_written_with_is_expanded(
 ) -> None:
     """Properties, arguments, conditions, yaml of the folder, and packages, wherever they are."""
     pytest.importorskip("pinocchio")
-    own = tmp_path / "robots" / "hand" / "urdf"
-    own.mkdir(parents=True)
-    (own / "sizes.yaml").write_text("hand: {long: 0.05, angle: !degrees 90}\n")
+    urdf_folder = tmp_path / "robots" / "hand" / "urdf"
+    urdf_folder.mkdir(parents=True)
+    (urdf_folder / "sizes.yaml").write_text("hand: {long: 0.05, angle: !degrees 90}\n")
     place = "${max(long, 0.01) * 2 * sin(sizes.hand.angle) + (0 if true else 1)}"
-    path = robot(own / "hand.xacro", HEAD.replace("true", "True"), place.replace("true", "True"))
+    path = robot(
+        urdf_folder / "hand.xacro", HEAD.replace("true", "True"), place.replace("true", "True")
+    )
     packages = {
         "ROS_PACKAGE_PATH": tmp_path / "src",
         "AMENT_PREFIX_PATH": tmp_path / "prefix" / "share",
@@ -156,18 +163,18 @@ def test_what_robots_are_written_with_is_expanded(
         "</joint></xacro:macro></robot>"
     )
     run("import", path, "--out", out, "--check").fine()
-    found = ik.load_robot(out)
-    assert found.links(found.home)["left_1"][2, 3] == pytest.approx(0.1)
-    assert "more" in found.links(found.home)
+    imported_robot = ik.load_robot(out)
+    assert imported_robot.links(imported_robot.home)["left_1"][2, 3] == pytest.approx(0.1)
+    assert "more" in imported_robot.links(imported_robot.home)
 
 
 def test_robots_larger_than_any(run: Command, tmp_path: Path) -> None:
     path, out = robot(tmp_path / "x.urdf"), tmp_path / "mine.yaml"
     plain, end = path.read_text().removesuffix("</robot>"), tmp_path / "other.yaml"
     ends = '<joint name="j{0}" type="{1}"><parent link="palm"/><child link="x{0}"/>'
-    more = f'<link name="x{{0}}"/>{ends}<limit lower="0" upper="1" velocity="1"/></joint>'
+    template = f'<link name="x{{0}}"/>{ends}<limit lower="0" upper="1" velocity="1"/></joint>'
     fixed, fingers = (
-        "".join(more.format(i, kind) for i in range(1200)) for kind in ("fixed", "revolute")
+        "".join(template.format(i, kind) for i in range(1200)) for kind in ("fixed", "revolute")
     )
     for added, says in ((fixed, "1205 links"), (fingers[: fingers.index("x300")], "304 moving jo")):
         text = added[: added.rindex("<link")] if added is not fixed else added

@@ -45,8 +45,8 @@ def test_solves_events_and_reasons(run_process: Command, run: Command, folder: P
     for words, count in ((("--solve", "2"), 1), (("--most", "2"), 2), (("--status", "SOLVED"), 3)):
         assert run("log", "solves", hand_first, *words).out.split().count("SOLVED") == count
     assert "hand alignment" in events
-    why = run_process("log", "why", dls, "4").fine().out
-    assert all(word in why for word in ("enhanced-dls", "thumb reaching", "thumb misses"))
+    reason = run_process("log", "why", dls, "4").fine().out
+    assert all(word in reason for word in ("enhanced-dls", "thumb reaching", "thumb misses"))
     assert "solved" in run("log", "why", dls, "--solve", "1").fine().out
 
 
@@ -62,8 +62,8 @@ def test_compare(run: Command, folder: Path) -> None:
         "by both, by neither"
     )
     assert "hand-first" in run("log", "compare", *files, "--solve", 4).out
-    other = run("log", "compare", *files, "--methods", "enhanced-dls", "hand-first").out
-    rows = [line.split()[0] for line in other.splitlines() if " of 4" in line]
+    other_methods = run("log", "compare", *files, "--methods", "enhanced-dls", "hand-first").out
+    rows = [line.split()[0] for line in other_methods.splitlines() if " of 4" in line]
     assert rows == ["enhanced-dls", "hand-first"]
 
 
@@ -92,11 +92,11 @@ def test_export_for_a_viewer(run_process: Command, folder: Path, tmp_path: Path)
 
 def test_export_of_tables(run: Command, folder: Path, tmp_path: Path) -> None:
     log = folder / "enhanced-dls.mcap"
-    for what in ("iterations", "solves", "events"):
-        table = getattr(ik.logs.open(log), what)()
+    for table_name in ("iterations", "solves", "events"):
+        table = getattr(ik.logs.open(log), table_name)()
         for suffix, read in ((".parquet", pl.read_parquet), (".csv", pl.read_csv)):
-            path = tmp_path / f"{what}{suffix}"
-            run("log", "export", log, "--what", what, "--out", path).fine()
+            path = tmp_path / f"{table_name}{suffix}"
+            run("log", "export", log, "--what", table_name, "--out", path).fine()
             assert read(path).height == len(table)
     path = tmp_path / "other"
     run("log", "export", log, "--to", "csv", "--phase", "hand-alignment", "--out", path)

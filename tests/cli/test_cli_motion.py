@@ -37,24 +37,24 @@ def test_contacts_are_followed_and_others_read_the_motion(
     points, normals = robot.contacts(path)
     frames = write(tmp_path, points=points, normals=normals, times=0.1 * np.arange(30))
     words = ("follow", frames, "--robot", "kuka_lwr_barrett", "--period", 0.01)
-    found = {}
+    motions = {}
     for suffix in ("mcap", "npz", "csv"):
         out = tmp_path / f"motion.{suffix}"
         done = run(*words, "--out", out).fine()
         assert "following" in done.out
-        found[suffix] = out
-    arrays = np.load(found["npz"])
+        motions[suffix] = out
+    arrays = np.load(motions["npz"])
     assert set(arrays["status"][1:]) == {"following"}
     assert arrays["actuators"].tolist() == list(robot.actuators)
     assert arrays["q"].shape == (len(arrays["times"]), 14)
     velocity = np.diff(arrays["q"], axis=0) / 0.01
     np.testing.assert_allclose(arrays["velocity"][1:], velocity, atol=1e-12)
-    with found["csv"].open() as stream:
+    with motions["csv"].open() as stream:
         rows = list(csv.reader(stream))
     assert rows[0][:3] == ["time", "lwr_joint_1", "lwr_joint_2"]
     np.testing.assert_array_equal(np.array(rows[1:], dtype=float)[:, 1:15], arrays["q"])
     topics: dict[str, list[Any]] = {}
-    for message in read_ros2_messages(str(found["mcap"])):
+    for message in read_ros2_messages(str(motions["mcap"])):
         topics.setdefault(message.channel.topic, []).append(message.ros_msg)
     (trajectory,) = topics["/joint_trajectory"]
     assert trajectory.joint_names == list(robot.actuators)
@@ -91,26 +91,26 @@ def test_world_landmarks_are_said_and_the_period_is_not_smoothed(
     run: Command, tmp_path: Path, robot: ik.ArmHand
 ) -> None:
     frame = hand(0.5, np.zeros(3))
-    way = np.linspace(0.5, 0.9, 31)
-    seen = np.stack([hand(bend, np.zeros(3)) - frame.mean(axis=0) for bend in way])
+    bends = np.linspace(0.5, 0.9, 31)
+    seen_frames = np.stack([hand(bend, np.zeros(3)) - frame.mean(axis=0) for bend in bends])
     slow = RETARGET.replace("0.5", "0.05")
     (tmp_path / "hand.yaml").write_text("robot: kuka_lwr_barrett\n" + slow)
     ends = []
     for period in (0.002, 0.02):
-        frames, out = write(tmp_path, keypoints=seen), tmp_path / "motion.npz"
+        frames, out = write(tmp_path, keypoints=seen_frames), tmp_path / "motion.npz"
         words = ("--retarget", tmp_path / "hand.yaml", "--period", period, "--out", out)
         done = run("follow", frames, *words)
         assert done.err == ""
         assert "MediaPipe's world landmarks" in " ".join(done.out.split())
-        found = np.load(out)
-        ends.append(robot.contacts(found["q"][np.searchsorted(found["times"], 0.9)])[0])
+        motion = np.load(out)
+        ends.append(robot.contacts(motion["q"][np.searchsorted(motion["times"], 0.9)])[0])
     # As smooth at a fast cycle as at a slow one.
     assert np.linalg.norm(ends[0] - ends[1], axis=1).max() < 2e-3
 
 
 def test_image_landmarks_are_one_line(run: Command, tmp_path: Path) -> None:
-    seen = np.tile(3.0 * hand(0.5, np.zeros(3)) + [0.3, 0.5, 1e-7], (3, 1, 1))
-    frames, out = write(tmp_path, keypoints=seen), tmp_path / "motion.mcap"
+    image_frames = np.tile(3.0 * hand(0.5, np.zeros(3)) + [0.3, 0.5, 1e-7], (3, 1, 1))
+    frames, out = write(tmp_path, keypoints=image_frames), tmp_path / "motion.mcap"
     done = run("follow", frames, "--robot", "kuka_lwr_barrett", "--out", out)
     assert "frames.npz: keypoints: " in done.error
     assert "world landmarks" in done.error
@@ -128,8 +128,8 @@ def test_the_motion_is_written(run: Command, tmp_path: Path) -> None:
         first, last = (
             (picture.seek(i), picture.convert("RGB"))[1] for i in (0, picture.n_frames - 1)
         )
-        moved = np.asarray(last).astype(int) - np.asarray(first).astype(int)
-    assert np.abs(moved).mean() > 1
+        steps = np.asarray(last).astype(int) - np.asarray(first).astype(int)
+    assert np.abs(steps).mean() > 1
     assert done.out.startswith("REACHED")
     assert "going" in done.out
     (trajectory,) = [
@@ -156,17 +156,17 @@ def test_what_was_chosen_is_reached(run: Command, ranked: Path, tmp_path: Path) 
     """The first of several, or another, by the very posture; with the object in the hand."""
     out, entries = tmp_path / "way.npz", json.loads(ranked.read_text())["ranked"]
     words = ("reach", ranked, "--scene", "table", "--out", out)
-    reached = []
+    distances = []
     for rank, entry in enumerate(entries, 1):
         done = run(*words, *(("--rank", str(rank)) if rank > 1 else ()))
         assert (done.exit, done.err) in ((0, ""), (1, ""))
         if done.exit == 0:
             np.testing.assert_array_equal(np.load(out)["q"][-1], entry["solution"]["q"])
-            reached.append((rank, entry))
-    assert reached
-    rank, entry = reached[0]
-    more = ("--direction", "0", "0", "-1", "--lift", "0.05", "--retreat", "0.05")
-    done = run(*words, "--rank", str(rank), *more).fine()
-    found = np.load(out)
-    assert set(found["part"]) == {"going", "coming", "closing", "lifting", "retreating"}
-    assert (found["q"] == entry["solution"]["q"]).all(axis=1).any()
+            distances.append((rank, entry))
+    assert distances
+    rank, entry = distances[0]
+    path_options = ("--direction", "0", "0", "-1", "--lift", "0.05", "--retreat", "0.05")
+    done = run(*words, "--rank", str(rank), *path_options).fine()
+    motion = np.load(out)
+    assert set(motion["part"]) == {"going", "coming", "closing", "lifting", "retreating"}
+    assert (motion["q"] == entry["solution"]["q"]).all(axis=1).any()

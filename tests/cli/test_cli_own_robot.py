@@ -20,11 +20,13 @@ PHALANX = """<collision><origin xyz="0 0 {middle}"/><geometry>
 <box size="0.02 0.016 {length}"/></geometry></collision>"""
 
 
-def moves(name: str, parent: str, child: str, xyz: str, axis: str, limits: str, **more: str) -> str:
+def moves(
+    name: str, parent: str, child: str, xyz: str, axis: str, limits: str, **attributes: str
+) -> str:
     """A joint between limits, or one that turns without end."""
     low, high = limits.split() if limits else ("", "")
-    more |= {"limit": f'lower="{low}" upper="{high}" velocity="0" effort="1"'}
-    return joint(name, parent, child, xyz=xyz, axis=axis, **more)
+    attributes |= {"limit": f'lower="{low}" upper="{high}" velocity="0" effort="1"'}
+    return joint(name, parent, child, xyz=xyz, axis=axis, **attributes)
 
 
 def hand(folder: Path, shapes: bool = True) -> Path:
@@ -33,7 +35,7 @@ def hand(folder: Path, shapes: bool = True) -> Path:
     text = link("palm")
     for name, x, side in (("ff", -0.03, -1), ("mf", 0.03, -1), ("opposed", 0.0, 1)):
         place, axis = f"{x} {0.04 * side} 0.05", f"{side} 0 0"
-        text += link(f"{name}_1") + link(f"{name}_2") + link(f"{name}_3", inside=end)
+        text += link(f"{name}_1") + link(f"{name}_2") + link(f"{name}_3", content=end)
         text += moves(f"{name}_a", "palm", f"{name}_1", place, "0 1 0", "-0.3 0.3")
         text += moves(f"{name}_b", f"{name}_1", f"{name}_2", "0 0 0.01", axis, "-0.1 1.4")
         text += moves(f"{name}_c", f"{name}_2", f"{name}_3", "0 0 0.04", axis, "0 1.5")
@@ -92,8 +94,10 @@ def test_the_arm_s_closed_form_is_said_and_its_lack_warned_of(run: Command, tmp_
     assert "no known closed form" not in done.out
     out.unlink()
     # The last two axes moved aside: no two of the last three meet any more.
-    moved = path.read_text().replace("0.08 0 0", "0.08 0 0.06").replace("0.1 0 0", "0.1 0 0.05")
-    path.write_text(moved)
+    offset_text = (
+        path.read_text().replace("0.08 0 0", "0.08 0 0.06").replace("0.1 0 0", "0.1 0 0.05")
+    )
+    path.write_text(offset_text)
     done = run("import", path, hand(tmp_path), "--out", out).fine()
     assert "no known closed form" in " ".join(done.out.split())
 
@@ -147,22 +151,26 @@ def test_a_humanoid_s_trunk_and_sides_are_found(
     pytest.importorskip("pinocchio")
     shipped, out = ik.load_robot("g1+dex3"), tmp_path / "mine.yaml"
     done = run("import", humanoid(tmp_path, shipped), "--out", out, "--check").fine()
-    said = " ".join(done.out.split())
+    text = " ".join(done.out.split())
     for words in (
         "31 motors (3 trunk; left 7 arm, 7 hand; right 7 arm, 7 hand), 6 fingers",
         "trunk torso_link: last link that carries all palms",
         "locked leg, head: moves no palm",
         "equal to the reference library",
     ):
-        assert words in said, done.out
+        assert words in text, done.out
     robot = ik.load_robot(out)
     assert robot.description.trunk == shipped.description.trunk
-    for ours, known in zip(robot.description.sides, shipped.description.sides, strict=True):
-        assert (ours.name, ours.arm, set(ours.hand)) == (known.name, known.arm, set(known.hand))
-        assert set(ours.fingers) == set(known.fingers)
+    for ours, shipped_side in zip(robot.description.sides, shipped.description.sides, strict=True):
+        assert (ours.name, ours.arm, set(ours.hand)) == (
+            shipped_side.name,
+            shipped_side.arm,
+            set(shipped_side.hand),
+        )
+        assert set(ours.fingers) == set(shipped_side.fingers)
     assert yaml.safe_load(out.read_text())["robot"]["locked"] == {"leg": -0.2, "head": 0}
     targets = [robot.contacts(q) for q in robot.random(rng, 20)]
-    points, normals = (np.array(one) for one in zip(*targets, strict=True))
+    points, normals = (np.array(rows) for rows in zip(*targets, strict=True))
     assert ik.Solver(robot).solve_batch(points, normals).success.all()
 
 
@@ -184,9 +192,9 @@ def test_palms_of_a_body_are_named(run: Command, tmp_path: Path) -> None:
         assert says in refused.error
     name = '<joint name="right_elbow_joint" type="revolute">'
     path.write_text(path.read_text().replace(name, f'{name}<mimic joint="left_elbow_joint"/>'))
-    other = tmp_path / "other.yaml"
-    error = run("import", path, "--palm", *palms, "--out", other).error
-    assert error.startswith(f"{other}: sides.right: joint 'right_elbow_joint' follows motor ")
+    other_file = tmp_path / "other.yaml"
+    error = run("import", path, "--palm", *palms, "--out", other_file).error
+    assert error.startswith(f"{other_file}: sides.right: joint 'right_elbow_joint' follows motor ")
     assert not list(tmp_path.glob("*other*"))
 
 
@@ -250,9 +258,9 @@ def test_the_fixed_jaw_of_a_named_palm_faces_the_one_that_moves(
         return f'<collision>{origin}<geometry><box size="{size}"/></geometry></collision>'
 
     text = link("base") + chain(tmp_path, ARM[:4])
-    text += link("roll", inside=box("0 -0.03 0.05", "0.02 0.01 0.1"))
+    text += link("roll", content=box("0 -0.03 0.05", "0.02 0.01 0.1"))
     text += moves("wrist_roll", "wrist_flex_link", "roll", "0 0 0.1", "0 0 1", "-2 2")
-    text += link("end", inside=box("0 0 0.04", "0.02 0.01 0.08"))
+    text += link("end", content=box("0 0 0.04", "0.02 0.01 0.08"))
     text += moves("j", "roll", "end", "0 0.03 0.02", "1 0 0", "0 1")
     path, out = urdf(tmp_path / "so.urdf", text), tmp_path / "mine.yaml"
     run("import", path, "--palm", "roll", "--out", out).fine()
@@ -332,13 +340,15 @@ def test_refusals_leave_nothing(
     monkeypatch.chdir(tmp_path)
     hand(tmp_path)
     body = arm(tmp_path).read_text().partition('<link name="l0"/>')[2].removesuffix("</robot>\n")
-    other = f'<link name="l0"/>{body}'.replace('"l', '"m').replace('"j', '"k').replace('"f"', '"g"')
-    body = f'<link name="base"/><link name="l0"/>{body}{other.replace("tool_", "tool2_")}'
+    other_text = (
+        f'<link name="l0"/>{body}'.replace('"l', '"m').replace('"j', '"k').replace('"f"', '"g"')
+    )
+    body = f'<link name="base"/><link name="l0"/>{body}{other_text.replace("tool_", "tool2_")}'
     Path("two.urdf").write_text(f'<robot name="two">{body}</robot>')
-    before = sorted(tmp_path.iterdir())
+    files_before = sorted(tmp_path.iterdir())
     error = run("import", "--out", "mine.yaml", *words).error
     assert says in error
-    assert sorted(tmp_path.iterdir()) == before
+    assert sorted(tmp_path.iterdir()) == files_before
 
 
 @pytest.mark.opengl
@@ -358,12 +368,12 @@ def gripper(folder: Path) -> Path:
     path = arm(folder)
     text = path.read_text().replace("</robot>", "")
     body = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
-    text += link("bar") + link("propeller", inside=body.format("package://jaws/meshes/none.stl"))
+    text += link("bar") + link("propeller", content=body.format("package://jaws/meshes/none.stl"))
     text += moves("bar", "tool_flange", "bar", "0.04 0 0", "0 0 1", "0 0", kind="fixed")
     text += moves("gripper", "tool_flange", "propeller", "0.02 0 0", "1 0 0", "", kind="continuous")
     mimic = '<mimic joint="left" multiplier="-1"/></joint>'
     for side, mesh in (("left", "meshes/jaw.stl"), ("right", "package://jaws/meshes/jaw.stl")):
-        text += link(f"{side}_jaw", inside=body.format(mesh))
+        text += link(f"{side}_jaw", content=body.format(mesh))
         ends = "0.015 0.037" if side == "left" else "-0.037 -0.015"
         jaw = moves(side, "bar", f"{side}_jaw", "0 0 0", "0 1 0", ends)
         jaw = jaw.replace("revolute", "prismatic")
@@ -383,9 +393,9 @@ def test_a_relative_file_finds_its_meshes_and_a_propeller_is_no_thumb(
     done = run(
         "import", "jaws/robot.urdf", "--palm", "tool_flange", "--out", "mine.yaml", "--check"
     ).fine()
-    said = " ".join(done.out.split())
-    assert "'package://jaws/meshes/none.stl'" in said
-    assert "locked gripper: continuous joint" in said
+    output = " ".join(done.out.split())
+    assert "'package://jaws/meshes/none.stl'" in output
+    assert "locked gripper: continuous joint" in output
     robot, text = ik.load_robot("mine.yaml"), Path("mine.yaml").read_text()
     assert len(robot.fingers) == 2
     assert robot.actuators == ("j0", "j1", "j2", "j3", "j4", "j5", "left")
@@ -395,9 +405,9 @@ def test_a_relative_file_finds_its_meshes_and_a_propeller_is_no_thumb(
     # What the comment says may be deleted may be deleted.
     assert "delete its line under `fingers`" in text
     lines = text.splitlines(keepends=True)
-    kept = [x for x in lines if not x.startswith(("thumb:", f"  {robot.thumb}: {{link"))]
-    assert len(kept) == len(lines) - 2
-    Path("mine.yaml").write_text("".join(kept))
+    remaining_lines = [x for x in lines if not x.startswith(("thumb:", f"  {robot.thumb}: {{link"))]
+    assert len(remaining_lines) == len(lines) - 2
+    Path("mine.yaml").write_text("".join(remaining_lines))
     assert ik.load_robot("mine.yaml").fingers == robot.fingers[1:]
 
 
@@ -406,14 +416,14 @@ def test_a_missing_package_is_said_once(run: Command, tmp_path: Path) -> None:
     for name in ("ff_1", "mf_1", "opposed_1"):
         mesh = f'<mesh filename="package://shapes_of_it/meshes/{name}.stl"/>'
         shape = f"<collision><geometry>{mesh}</geometry></collision>"
-        text = text.replace(link(name), link(name, inside=shape))
+        text = text.replace(link(name), link(name, content=shape))
     path.write_text(text)
     done = run("import", path, "--out", tmp_path / "mine.yaml")
     assert done.out.count("package 'shapes_of_it' is not found") == 1
-    said = " ".join(done.out.split())
-    assert "3 meshes" in said
-    assert "package://shapes_of_it/meshes/ff_1.stl" in said
-    assert "ROS_PACKAGE_PATH=FOLDER casadi-ik import" in said
+    output = " ".join(done.out.split())
+    assert "3 meshes" in output
+    assert "package://shapes_of_it/meshes/ff_1.stl" in output
+    assert "ROS_PACKAGE_PATH=FOLDER casadi-ik import" in output
 
 
 HEADER = "finger,index_proximal_slider,index_middle_slider,x,y,z,qw,qx,qy,qz\n"
@@ -425,9 +435,9 @@ def refused(run: Command, tmp_path: Path) -> Callable[..., str]:
     """Calls `calibrate` and gives the refusal; nothing may be written."""
 
     def call(path: Path, *words: Any, out: str = "out.yaml", robot: str = "ar10") -> str:
-        before = sorted(tmp_path.rglob("*"))
+        files_before = sorted(tmp_path.rglob("*"))
         error = run("calibrate", path, "--robot", robot, "--out", tmp_path / out, *words).error
-        assert sorted(tmp_path.rglob("*")) == before
+        assert sorted(tmp_path.rglob("*")) == files_before
         return error
 
     return call

@@ -65,9 +65,9 @@ def commands(run: Command, group: str = "") -> Iterator[str]:
 
 def test_help(run: Command) -> None:
     """It fits a terminal of 80 columns; without a word behind it, the program shows it."""
-    found = ["", *commands(run)]
-    assert {"solve", "batch", "view", "log", "log info", "log merge"} < set(found)
-    for command in found:
+    names = ["", *commands(run)]
+    assert {"solve", "batch", "view", "log", "log info", "log merge"} < set(names)
+    for command in names:
         done = run(*command.split(), "--help").fine()
         assert done.out.startswith(f"usage: casadi-ik {command}".rstrip())
         assert max(map(len, done.out.splitlines())) <= 80
@@ -224,36 +224,36 @@ def test_interrupted(
     np.savez(targets, points=points, normals=normals)
     process = start_batch(targets, out, "--method", "ipopt", "--jobs", str(jobs))
     assert wait_for(tmp_path, finished)
-    for one in signals:
-        process.send_signal(one)
+    for signal_number in signals:
+        process.send_signal(signal_number)
         time.sleep(0.01)
-    said, error = process.communicate(timeout=600)  # the batch would take longer
+    output, error = process.communicate(timeout=600)  # the batch would take longer
     interrupted = signals[0] == signal.SIGINT
     ended = "interrupted" if interrupted else "terminated"
     assert process.returncode == (130 if interrupted else 143), error
     lines = error.splitlines()
-    assert (said, lines[-1]) == ("", f"casadi-ik: error: {ended}")
-    again = len(signals) > 2
-    left = {path for path in tmp_path.iterdir() if not (again and path.name.startswith("."))}
+    assert (output, lines[-1]) == ("", f"casadi-ik: error: {ended}")
+    is_repeated = len(signals) > 2
+    left = {path for path in tmp_path.iterdir() if not (is_repeated and path.name.startswith("."))}
     assert left == ({targets, out} if out.exists() else {targets})
     if not out.exists():
-        assert again or not finished
+        assert is_repeated or not finished
         return
-    with np.load(out) as kept:
-        count = len(kept["q"])
+    with np.load(out) as answers:
+        count = len(answers["q"])
         assert 0 < count < 30_000
-        assert {len(kept[name]) for name in kept.files} == {count}
-        solved, (reached, _) = kept["success"], robot.contacts(kept["q"])
+        assert {len(answers[name]) for name in answers.files} == {count}
+        solved, (points_reached, _) = answers["success"], robot.contacts(answers["q"])
     assert solved.any()
-    np.testing.assert_allclose(reached[solved], points[:count][solved], atol=5e-3)
-    said = f"casadi-ik: interrupted: {out} keeps the first {count} of 30000 rows"
-    assert again or said in lines
+    np.testing.assert_allclose(points_reached[solved], points[:count][solved], atol=5e-3)
+    output = f"casadi-ik: interrupted: {out} keeps the first {count} of 30000 rows"
+    assert is_repeated or output in lines
 
 
-def start_batch(targets: Path, out: Path, *more: str) -> subprocess.Popen[str]:
+def start_batch(targets: Path, out: Path, *options: str) -> subprocess.Popen[str]:
     """A batch that takes minutes."""
     return subprocess.Popen(
-        [*PROGRAM, "batch", targets, "--robot", ROBOT, "--out", out, *more],
+        [*PROGRAM, "batch", targets, "--robot", ROBOT, "--out", out, *options],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -290,13 +290,13 @@ def test_a_killed_batch(run: Command, tmp_path: Path) -> None:
     young = tmp_path / f".batch-{os.getpid()}-running"
     young.mkdir()
     np.savez(targets, points=points[:2], normals=normals[:2])
-    again = ("batch", targets, "--robot", robot.name, "--out", out)
-    assert run(*again).exit == 0
+    repeat_words = ("batch", targets, "--robot", robot.name, "--out", out)
+    assert run(*repeat_words).exit == 0
     assert left.exists()  # a process elsewhere could be at it
     then = time.time() - 3700
     for path in (*left.iterdir(), left, young):
         os.utime(path, (then, then))
-    assert run(*again).exit == 0
+    assert run(*repeat_words).exit == 0
     assert sorted(tmp_path.iterdir()) == sorted([young, out, targets])
 
 

@@ -230,19 +230,19 @@ def test_one_line_and_nothing_written(
 ) -> None:
     words, _, expected = line.partition(" => ")
     monkeypatch.chdir(place)
-    before = sorted(place.rglob("*"))
+    files_before = sorted(place.rglob("*"))
     error = run(*words.split()).error
     assert all(part in error for part in expected.split()), error
-    assert sorted(place.rglob("*")) == before
+    assert sorted(place.rglob("*")) == files_before
 
 
 def test_a_refusal_of_a_process(run_process: Command, place: Path) -> None:
     assert "log.mcap: solve 99 " in run_process("log", "why", place / "log.mcap", 99).error
 
 
-def _changed(array: np.ndarray, where: Any, value: float) -> np.ndarray:
+def _changed(array: np.ndarray, index: Any, value: float) -> np.ndarray:
     changed = array.copy()
-    changed[where] = value
+    changed[index] = value
     return changed
 
 
@@ -283,11 +283,11 @@ def test_damaged_targets(
     run: Command, target_file: Callable[..., Path], rng: np.random.Generator, tmp_path: Path
 ) -> None:
     path, out = target_file(), tmp_path / "new.npz"
-    whole = path.read_bytes()
+    data = path.read_bytes()
     refusals = 0
     for _ in range(60):
-        damaged = bytearray(whole)
-        start = int(rng.integers(0, len(whole) - 20))
+        damaged = bytearray(data)
+        start = int(rng.integers(0, len(data) - 20))
         damaged[start : start + 20] = rng.bytes(20)
         path.write_bytes(damaged)
         done = run("batch", path, *ROBOT.split(), "--out", out)
@@ -323,6 +323,6 @@ def test_what_ranked_files_are_refused(
     change(data)
     monkeypatch.chdir(place)
     Path("other.json").write_text(json.dumps(data))
-    more = {"rank": ("--rank", "4"), "pose": ("--object-pose", *"000000")}.get(case, ())
-    assert says in run("reach", "other.json", "--out", "way.npz", *more).error
+    options = {"rank": ("--rank", "4"), "pose": ("--object-pose", *"000000")}.get(case, ())
+    assert says in run("reach", "other.json", "--out", "way.npz", *options).error
     assert not Path("way.npz").exists()

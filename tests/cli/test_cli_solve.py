@@ -32,21 +32,21 @@ def test_solved_grasp(
         "pinch.mcap",
         "pinch.yaml",
     ]
-    found = json.loads(out.read_text())
-    assert list(found) == [
+    report = json.loads(out.read_text())
+    assert list(report) == [
         *("success", "status", "method", "robot", "actuators", "q", "iterations", "restarts"),
         *("time", "contacts", "diagnosis"),
     ]
-    assert (found["success"], found["status"], found["diagnosis"]) == (True, "SOLVED", None)
-    assert (found["method"], found["robot"]) == ("enhanced-dls", "kuka_lwr_barrett")
-    assert tuple(found["actuators"]) == robot.actuators
-    assert tuple(found["contacts"]) == robot.fingers
-    assert {frozenset(one) for one in found["contacts"].values()} == {
+    assert (report["success"], report["status"], report["diagnosis"]) == (True, "SOLVED", None)
+    assert (report["method"], report["robot"]) == ("enhanced-dls", "kuka_lwr_barrett")
+    assert tuple(report["actuators"]) == robot.actuators
+    assert tuple(report["contacts"]) == robot.fingers
+    assert {frozenset(names) for names in report["contacts"].values()} == {
         frozenset(("position_error", "angle_error", "ok"))
     }
-    errors = [contact["position_error"] for contact in found["contacts"].values()]
-    away = robot.contacts(found["q"])[0] - robot.contacts(POSTURE)[0]
-    np.testing.assert_allclose(np.linalg.norm(away, axis=1), errors, atol=1e-12)
+    errors = [contact["position_error"] for contact in report["contacts"].values()]
+    offsets = robot.contacts(report["q"])[0] - robot.contacts(POSTURE)[0]
+    np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), errors, atol=1e-12)
 
 
 def test_the_same_as_the_api(
@@ -57,9 +57,9 @@ def test_the_same_as_the_api(
     run("solve", path, *FAST, "--out", out, "--limits", "ignore", "--q0", *start)
     solver = ik.Solver(robot, "enhanced-dls", limits="ignore", finger_step="closed-form")
     solution = solver.solve(ik.load_grasp(path), q0=start)
-    found = json.loads(out.read_text())
-    assert found["q"] == solution.q.tolist()
-    assert found["iterations"] == solution.iterations
+    report = json.loads(out.read_text())
+    assert report["q"] == solution.q.tolist()
+    assert report["iterations"] == solution.iterations
 
 
 def test_what_may_be_said(
@@ -70,8 +70,8 @@ def test_what_may_be_said(
     for start in ([",".join(numbers)], numbers, [",".join(numbers[:7]), " ".join(numbers[7:])]):
         assert run("solve", grasp_file(), *FAST, "--q0", *start).exit in (0, 1)
     narrow = ("--tolerance-position", "0.0025", "--tolerance-angle", "0.02")
-    said = run("solve", grasp_file(), *FAST, *narrow).out
-    assert (said.count(" 2.5 mm "), said.count(" 1.146 deg ")) == (3, 3)
+    text = run("solve", grasp_file(), *FAST, *narrow).out
+    assert (text.count(" 2.5 mm "), text.count(" 1.146 deg ")) == (3, 3)
     assert run("solve", grasp_file(), "--method", "enhanced-dls").exit == 0
     path = grasp_file(robot="no_such_robot")
     assert run("solve", path, *FAST, "--robot", own_robot).exit == 0
@@ -85,8 +85,8 @@ def test_fixed_actuators_stay(run: Command, grasp_file: GraspFile, tmp_path: Pat
     fixed = ("--fixed", "lwr_joint_3=0.2", "--fixed", "bh_spread=0.1")
     assert run("solve", grasp_file(), *fixed, "--out", out).exit in (0, 1)
     answer = json.loads(out.read_text())
-    found = dict(zip(answer["actuators"], answer["q"], strict=True))
-    assert (found["lwr_joint_3"], found["bh_spread"]) == (0.2, 0.1)
+    positions = dict(zip(answer["actuators"], answer["q"], strict=True))
+    assert (positions["lwr_joint_3"], positions["bh_spread"]) == (0.2, 0.1)
     refused = run("solve", grasp_file(), *FAST, *fixed).error
     assert "'enhanced-dls'" in refused
 
@@ -101,17 +101,17 @@ def test_not_solved_says_why(run: Command, far_away: Path, tmp_path: Path) -> No
     done = run("solve", far_away, "--out", out)
     assert (done.exit, done.err) == (1, "")
     assert done.out.startswith("UNREACHABLE")
-    found = json.loads(out.read_text())
-    diagnosis = found["diagnosis"]
+    report = json.loads(out.read_text())
+    diagnosis = report["diagnosis"]
     # A tolerance of more than 20 mm and 15 deg is no advice.
     assert "solvable within" not in " ".join(done.out.split())
     assert diagnosis["enough"]["position"] > 0.02
-    assert (found["status"], diagnosis["reason"]) == ("UNREACHABLE", "REACH")
+    assert (report["status"], diagnosis["reason"]) == ("UNREACHABLE", "REACH")
     assert diagnosis["established"] is True
     assert diagnosis["proof"]["kind"]
     assert diagnosis["reach"]["distance"] > diagnosis["reach"]["farthest"]
     assert set(diagnosis["nearest"]) == {"thumb", "finger_2", "finger_3"}
-    assert len(diagnosis["q"]) == len(found["actuators"])
+    assert len(diagnosis["q"]) == len(report["actuators"])
 
 
 def test_a_scene(run: Command, tmp_path: Path) -> None:
@@ -158,8 +158,8 @@ def test_a_free_finger(
     out = tmp_path / "two.json"
     two = {name: contacts[name] for name in ("thumb", "finger_2")}
     done = run("solve", grasp_file(contacts=two), "--out", out)
-    found = json.loads(out.read_text())["contacts"]["finger_3"]
-    assert found == {"position_error": None, "angle_error": None, "ok": True}
+    contact = json.loads(out.read_text())["contacts"]["finger_3"]
+    assert contact == {"position_error": None, "angle_error": None, "ok": True}
     (line,) = (line for line in done.out.splitlines() if line.split()[:1] == ["finger_3"])
     assert line.split() == ["finger_3", "free", "free", "ok"]
 
@@ -209,11 +209,11 @@ def test_contacts_go_with_the_object(
     turn = ["0.0", "0.0", "-0.01", "0", "0", "0.2"]
     done = run("solve", grasp_file(), *FAST, "--out", out, "--object-pose", *turn)
     assert done.exit == 0
-    reached, _ = robot.contacts(json.loads(out.read_text())["q"])
-    wanted, _ = robot.contacts(POSTURE)
+    points, _ = robot.contacts(json.loads(out.read_text())["q"])
+    stored_points, _ = robot.contacts(POSTURE)
     c, s = math.cos(0.2), math.sin(0.2)
-    moved = wanted @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [0, 0, -0.01]
-    assert np.linalg.norm(reached - moved, axis=1).max() < 5e-3
+    expected_points = stored_points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [0, 0, -0.01]
+    assert np.linalg.norm(points - expected_points, axis=1).max() < 5e-3
 
 
 @pytest.mark.filterwarnings("default:q0")
@@ -230,12 +230,12 @@ def test_units(run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path:
     """Degrees and mm where they are asked for; the answer is the same, files are in rad and m."""
     path, out = grasp_file(), tmp_path / "o.json"
     start = [f"{value:.17g}" for value in np.rad2deg(robot.home)]
-    said = ("--tolerance-position", "2", "--tolerance-angle", "1")
-    done = run("solve", path, "--out", out, "--deg", "--mm", *said, "--q0", *start).fine()
+    tolerances = ("--tolerance-position", "2", "--tolerance-angle", "1")
+    done = run("solve", path, "--out", out, "--deg", "--mm", *tolerances, "--q0", *start).fine()
     assert (done.out.count(" 2 mm "), done.out.count(" 1 deg ")) == (3, 3)
     in_mm = json.loads(out.read_text())
-    said = ("--tolerance-position", "0.002", "--tolerance-angle", f"{math.radians(1):.17g}")
-    done = run("solve", path, "--out", out, *said, "--no-deg", "--no-mm", "--q0", *robot.home)
+    tolerances = ("--tolerance-position", "0.002", "--tolerance-angle", f"{math.radians(1):.17g}")
+    done = run("solve", path, "--out", out, *tolerances, "--no-deg", "--no-mm", "--q0", *robot.home)
     assert (done.out.count(" 0.002 m "), done.out.count(" 0.01745 rad ")) == (3, 3)
     in_m = json.loads(out.read_text())
     assert in_mm["q"] == pytest.approx(in_m["q"], abs=1e-9)
@@ -265,10 +265,12 @@ def test_without_a_scene_an_object_in_the_hand_is_said(run: Command, tmp_path: P
     shipped = Path(__file__).parents[2] / "models" / "grasps" / "cup.yaml"
     text = shipped.read_text(encoding="utf-8")
     assert "0.126889040887" in text
-    moved = tmp_path / "moved.yaml"
-    moved.write_text(text.replace("0.126889040887", "0.086889040887"), encoding="utf-8")
+    moved_file = tmp_path / "moved.yaml"
+    moved_file.write_text(text.replace("0.126889040887", "0.086889040887"), encoding="utf-8")
     assert "overlap" not in run("solve", shipped).out
-    assert re.search(r"the shapes of \w+ and cup overlap by [\d.]+ mm", run("solve", moved).out)
+    assert re.search(
+        r"the shapes of \w+ and cup overlap by [\d.]+ mm", run("solve", moved_file).out
+    )
 
 
 def test_best_effort_writes_the_nearest_configuration(run: Command, tmp_path: Path) -> None:
@@ -277,7 +279,7 @@ def test_best_effort_writes_the_nearest_configuration(run: Command, tmp_path: Pa
         pose = ("--object-pose", 1, 0, 2, 0, 0, 0)
         done = run("solve", "cup", *pose, "--no-diagnose", "--out", out, *flags)
         assert done.exit == 1
-        found = json.loads(out.read_text())
-        assert found["status"] == status
-        errors[status] = max(item["position_error"] for item in found["contacts"].values())
+        report = json.loads(out.read_text())
+        assert report["status"] == status
+        errors[status] = max(item["position_error"] for item in report["contacts"].values())
     assert errors["NEAREST"] < errors["STALLED"]

@@ -16,23 +16,23 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 def described(robot: ArmHand) -> list[tuple[str, Any, Array]]:
     """Link, shape and (4, 4) pose in the link of every shape as it is described."""
     shapes = robot.description.shapes
-    found: list[tuple[str, Any, Array]] = []
-    for one in shapes.capsules:
-        if one.covers < 0:
-            length = float(np.linalg.norm(one.half))
+    solids: list[tuple[str, Any, Array]] = []
+    for capsule in shapes.capsules:
+        if capsule.covers < 0:
+            length = float(np.linalg.norm(capsule.half))
             pose = np.eye(4)
-            pose[:3, 3] = one.center
+            pose[:3, 3] = capsule.center
             if length:
-                pose[:3, :3] = along(one.half / length)
-            found.append((one.link, coal.Capsule(one.radius, 2 * length), pose))
+                pose[:3, :3] = frame_along(capsule.half / length)
+            solids.append((capsule.link, coal.Capsule(capsule.radius, 2 * length), pose))
     for solid in shapes.solids:
         x, y, z = solid.size.tolist()
         shape = coal.Box(x, y, z) if solid.kind == "box" else coal.Cylinder(x, y)
-        found.append((solid.link, shape, solid.pose))
-    return found
+        solids.append((solid.link, shape, solid.pose))
+    return solids
 
 
-def along(axis: Array) -> Array:
+def frame_along(axis: Array) -> Array:
     """(3, 3) rotation whose z is an axis."""
     side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
     side /= np.linalg.norm(side)
@@ -41,7 +41,7 @@ def along(axis: Array) -> Array:
 
 def in_scene() -> dict[str, tuple[Any, Array]]:
     """The scene's shapes with their poses."""
-    found: dict[str, tuple[Any, Array]] = {}
+    solids: dict[str, tuple[Any, Array]] = {}
     for name, entry in SCENE.items():
         pose = frame_matrix(Frame(tuple(entry["xyz"]), tuple(entry.get("rpy", (0, 0, 0)))))
         match entry["kind"]:
@@ -63,13 +63,13 @@ def in_scene() -> dict[str, tuple[Any, Array]]:
                 model.endModel()
                 model.buildConvexHull(True, "Qt")
                 shape = model.convex
-        found[name] = shape, pose
-    return found
+        solids[name] = shape, pose
+    return solids
 
 
-def distance(one: Any, at_one: Array, other: Any, at_other: Array) -> float:
+def distance(solid: Any, at_one: Array, other_solid: Any, at_other: Array) -> float:
     """Signed distance [m]."""
     request, result = coal.DistanceRequest(True), coal.DistanceResult()
     places = (coal.Transform3s(pose[:3, :3], pose[:3, 3]) for pose in (at_one, at_other))
     first, second = places
-    return float(coal.distance(one, first, other, second, request, result))
+    return float(coal.distance(solid, first, other_solid, second, request, result))

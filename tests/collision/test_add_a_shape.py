@@ -45,8 +45,8 @@ def test_a_kind_is_added_in_three_files(tmp_path: Path) -> None:
     replace(solids, '}\n"""Properties of all kinds', f'{row}}}\n"""Properties of all kinds')
     replace(solids, "def half_space()", f"{make}\n\ndef half_space()")
     driver = package / "compile" / "runtime" / "clearance.c"
-    before = "static LANES_TARGET along distance_along("
-    replace(driver, before, f"{distance}\n{before}")
+    original = "static LANES_TARGET along distance_along("
+    replace(driver, original, f"{distance}\n{original}")
     first = "  if (shape->kind == BOX)"
     replace(driver, first, f"{call}{first}")
     scene = package / "collision" / "scene_file.py"

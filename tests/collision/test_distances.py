@@ -31,40 +31,46 @@ def by_coal(robot: ik.ArmHand, q: np.ndarray, names: set[frozenset[str]]) -> np.
     """(k, pairs) the smallest signed distance of each pair of names."""
     shapes, scene = described(robot), in_scene()
     links = robot.links(q)
-    found = {name: np.full(len(q), np.inf) for name in names}
+    distances = {name: np.full(len(q), np.inf) for name in names}
     for i, (link, shape, pose) in enumerate(shapes):
-        others = [(n, s, None, p) for n, (s, p) in scene.items()]
-        others += [(n, s, p, None) for n, s, p in shapes[i + 1 :]]
-        for name, other, place, fixed in others:
+        obstacles = [(n, s, None, p) for n, (s, p) in scene.items()]
+        obstacles += [(n, s, p, None) for n, s, p in shapes[i + 1 :]]
+        for name, solid, place, fixed in obstacles:
             key = frozenset((link, name))
-            if key not in found:
+            if key not in distances:
                 continue
             for row in range(len(q)):
-                there = fixed if place is None else links[name][row] @ place
-                apart = distance(shape, links[link][row] @ pose, other, there)
-                found[key][row] = min(found[key][row], apart)
-    return found
+                pose_of_obstacle = fixed if place is None else links[name][row] @ place
+                separation = distance(shape, links[link][row] @ pose, solid, pose_of_obstacle)
+                distances[key][row] = min(distances[key][row], separation)
+    return distances
 
 
 def test_distances_are_those_of_coal_and_never_larger(robot, rng):
     around = surroundings(robot, ik.Scene(SCENE))
     q = robot.random(rng, 300)
     names = [frozenset(pair) for pair in around.table.names]
-    every = around.kernel.all_distances(q, around.poses, around.table)
+    all_distances = around.kernel.all_distances(q, around.poses, around.table)
     theirs = by_coal(robot, q, set(names))
     solids = {"palm", "l2", "base"}  # described as boxes and a cylinder
     for name in set(names):
-        ours = every[:, [i for i, other in enumerate(names) if other == name]].min(axis=1)
+        ours = all_distances[:, [i for i, obstacle in enumerate(names) if obstacle == name]].min(
+            axis=1
+        )
         coals = theirs[name]
-        apart = coals > 0
+        is_apart = coals > 0
         # Conservative wherever coal sees a gap, and whatever penetrates for coal does for us.
-        assert (ours[apart] <= coals[apart] + MICROMETRE).all(), name
-        assert (ours[~apart] <= MICROMETRE).all(), name
+        assert (ours[is_apart] <= coals[is_apart] + MICROMETRE).all(), name
+        assert (ours[~is_apart] <= MICROMETRE).all(), name
         if not (name & solids) and "block" not in name:
-            np.testing.assert_allclose(ours[apart], coals[apart], atol=2e-6, err_msg=str(name))
+            np.testing.assert_allclose(
+                ours[is_apart], coals[is_apart], atol=2e-6, err_msg=str(name)
+            )
         if len(name & solids) == 1 and not (name & set(SCENE)):
             # A capsule against a box or a cylinder of the robot itself is exact too.
-            np.testing.assert_allclose(ours[apart], coals[apart], atol=2e-6, err_msg=str(name))
+            np.testing.assert_allclose(
+                ours[is_apart], coals[is_apart], atol=2e-6, err_msg=str(name)
+            )
 
 
 def test_planes_round_a_hull_off_by_little(robot, rng):
@@ -73,9 +79,9 @@ def test_planes_round_a_hull_off_by_little(robot, rng):
     rows = np.array([{"l3", "block"} == set(pair) for pair in around.table.names])
     ours = around.kernel.all_distances(q, around.poses, around.table)[:, rows].min(axis=1)
     coals = by_coal(robot, q, {frozenset(("l3", "block"))})[frozenset(("l3", "block"))]
-    near = (coals > 0) & (coals < 0.2)
-    assert near.sum() > 15
-    assert (coals - ours)[near].max() < 0.02 * 0.24
+    is_near = (coals > 0) & (coals < 0.2)
+    assert is_near.sum() > 15
+    assert (coals - ours)[is_near].max() < 0.02 * 0.24
 
 
 def test_the_virtual_machine_gives_the_same(robot, rng):
@@ -84,11 +90,14 @@ def test_the_virtual_machine_gives_the_same(robot, rng):
     q = robot.random(rng, 100)
     tables = compiled.table, plain.table
     assert tables[0].names == tables[1].names
-    every = [one.kernel.all_distances(q, one.poses, one.table) for one in (compiled, plain)]
-    np.testing.assert_allclose(every[0], every[1], atol=3e-7)
-    least, which = compiled.kernel.min_distances(q, compiled.poses, compiled.table)
-    np.testing.assert_array_equal(least, every[0].min(axis=1))
-    np.testing.assert_array_equal(which, every[0].argmin(axis=1))
+    all_distances = [
+        checker.kernel.all_distances(q, checker.poses, checker.table)
+        for checker in (compiled, plain)
+    ]
+    np.testing.assert_allclose(all_distances[0], all_distances[1], atol=3e-7)
+    minima, pair_indices = compiled.kernel.min_distances(q, compiled.poses, compiled.table)
+    np.testing.assert_array_equal(minima, all_distances[0].min(axis=1))
+    np.testing.assert_array_equal(pair_indices, all_distances[0].argmin(axis=1))
 
 
 @pytest.mark.parametrize("name", ["three", "ar10"])
@@ -101,18 +110,20 @@ def test_shapes_come_no_nearer_than_by_steps_times_levers(robot, rng, name):
     longest = levers(robot.description, around.table)
     for size in (1e-3, 0.1):
         q = robot.random(rng, 60)
-        other = np.clip(
+        q_next = np.clip(
             q + size * (robot.upper - robot.lower) * rng.normal(size=q.shape),
             robot.lower,
             robot.upper,
         )
-        before, after = (
-            around.kernel.all_distances(x, around.poses, around.table) for x in (q, other)
+        distances_before, after = (
+            around.kernel.all_distances(x, around.poses, around.table) for x in (q, q_next)
         )
-        bound = np.abs(other - q) @ longest.T
-        assert (np.abs(after - before) <= bound + MICROMETRE).all()
-        moved = bound > 1e-5
-        assert (np.abs(after - before)[moved] / bound[moved]).max() > 0.5, "far too cautious"
+        bound = np.abs(q_next - q) @ longest.T
+        assert (np.abs(after - distances_before) <= bound + MICROMETRE).all()
+        has_moved = bound > 1e-5
+        assert (np.abs(after - distances_before)[has_moved] / bound[has_moved]).max() > 0.5, (
+            "far too cautious"
+        )
 
 
 def test_nan_is_not_free(robot):

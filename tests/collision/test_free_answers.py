@@ -81,9 +81,11 @@ def test_what_is_grasped_may_be_touched_by_the_fingers_alone(solver):
 def test_clearance_is_preferred_if_asked(solver):
     gained = []
     for name in ("cup", "apple", "banana", "mug"):
-        usual, far = (solver.solve(ik.load_grasp(name), prefer=p) for p in ("limits", "clearance"))
-        assert far.success
-        gained.append(far.clearance - usual.clearance)
+        usual, with_clearance = (
+            solver.solve(ik.load_grasp(name), prefer=p) for p in ("limits", "clearance")
+        )
+        assert with_clearance.success
+        gained.append(with_clearance.clearance - usual.clearance)
     assert min(gained) >= -1e-9
     assert max(gained) > 1e-3
 
@@ -92,20 +94,20 @@ def test_batches_are_what_single_solves_are(solver, robot):
     grasps = [ik.load_grasp(name) for name in ("cup", "mug", "banana")]
     arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
     points, normals = (np.stack(parts) for parts in zip(*arrays, strict=True))
-    held = ik.Scene(
+    scene_in_hand = ik.Scene(
         {"cup": {"kind": "object", "object": "cup"}},
         grasped="cup",
     )
     poses = np.stack([grasp.object_pose for grasp in grasps])
-    batch = ik.Solver(robot, scene=held).solve_batch(points, normals, object_pose=poses)
+    batch = ik.Solver(robot, scene=scene_in_hand).solve_batch(points, normals, object_pose=poses)
     assert batch.clearance.shape == (3,)
     assert (batch.clearance[batch.success] >= 0).all()
-    one = ik.Solver(robot, scene=held).solve_batch(
+    single_batch = ik.Solver(robot, scene=scene_in_hand).solve_batch(
         points[1:2], normals[1:2], object_pose=poses[1:2]
     )
-    np.testing.assert_allclose(one.q[0], batch.q[1], atol=1e-9)
+    np.testing.assert_allclose(single_batch.q[0], batch.q[1], atol=1e-9)
     with pytest.raises(ik.errors.InputError, match=r"object_pose:.*2.*3"):
-        ik.Solver(robot, scene=held).solve_batch(points, normals, object_pose=poses[:2])
+        ik.Solver(robot, scene=scene_in_hand).solve_batch(points, normals, object_pose=poses[:2])
     with pytest.raises(ik.errors.InputError, match="'grasped'"):
         solver.solve_batch(points, normals, object_pose=poses)
 
@@ -121,10 +123,10 @@ def test_poses_for_other_rows_are_refused(solver):
 
 def test_all_solutions_are_free(solver):
     cup = ik.load_grasp("cup")
-    found = solver.solve_all(cup, limit=4)
-    assert found
+    solutions = solver.solve_all(cup, limit=4)
+    assert solutions
     around = solver._engine.collision_query(solver._request.of_grasps([cup], None))
-    assert around.free(np.stack([one.q for one in found])).all()
+    assert around.free(np.stack([solution.q for solution in solutions])).all()
 
 
 def test_what_knows_no_scene_says_so(solver):
@@ -136,9 +138,11 @@ def test_other_methods_are_checked_at_the_end(robot):
     cup = ik.load_grasp("cup")
     wall = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3].tolist()}
     scene = ik.Scene({"balloon": wall})
-    other = ik.Solver(robot, "thumb-first", compiled=False, scene=scene).solve(cup, diagnose=False)
-    assert other.status is ik.Status.COLLISION
-    assert other.clearance < 0
+    paper_solution = ik.Solver(robot, "thumb-first", compiled=False, scene=scene).solve(
+        cup, diagnose=False
+    )
+    assert paper_solution.status is ik.Status.COLLISION
+    assert paper_solution.clearance < 0
 
 
 def test_a_solver_with_a_scene_can_be_copied(solver):
@@ -151,12 +155,12 @@ def test_an_answer_is_its_targets_own(solver, robot):
     """Whatever targets are solved with it: bit for bit, those included that have none."""
     rng = np.random.default_rng(4)
     points, normals = robot.contacts(robot.random(rng, 40))
-    whole = solver.solve_batch(points, normals)
-    assert (whole.status == ik.Status.COLLISION).sum() > 3
-    assert whole.success.sum() > 3
+    batch = solver.solve_batch(points, normals)
+    assert (batch.status == ik.Status.COLLISION).sum() > 3
+    assert batch.success.sum() > 3
     parts = [(points[i : i + 7], normals[i : i + 7]) for i in range(0, 40, 7)]
     blocks = list(solver.solve_blocks(parts))
     q = np.concatenate([block.solution.q for block in blocks])
-    np.testing.assert_array_equal(q, whole.q)
+    np.testing.assert_array_equal(q, batch.q)
     reports = [report for block in blocks for report in block.solution.collisions]
-    assert reports == list(whole.collisions)
+    assert reports == list(batch.collisions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from toy_robots import grasp_of, moved
+from toy_robots import grasp_of, moved_targets
 
 import casadi_ik as ik
 
@@ -32,7 +32,9 @@ def test_calls_find_the_same_free_answers_at_the_edge_of_the_tolerance(robot):
     q = robot.random(rng, 2500)
     clear = solver.solve_batch(*robot.contacts(q), q0=q, prefer="q0")
     free = clear.success & (np.abs(clear.q - q) < 1e-6).all(axis=1)
-    targets = moved(robot.contacts(q[free]), rng, 0.99 * tolerance.position, 0.99 * tolerance.angle)
+    targets = moved_targets(
+        robot.contacts(q[free]), rng, 0.99 * tolerance.position, 0.99 * tolerance.angle
+    )
     starts = robot.random(rng, len(targets[0]))
     missed = np.flatnonzero(~solver.solve_batch(*targets).success).tolist()
     assert len(missed) <= 5

@@ -27,37 +27,37 @@ def surfaces(rng: np.random.Generator, count: int) -> np.ndarray:
     """Points (count, 3) of a floor, a wall and a ball, as a camera sees them."""
     flat = rng.uniform([-0.8, -0.8, -0.21], [0.8, 0.8, -0.2], (count, 3))
     wall = rng.uniform([0.55, -0.5, -0.2], [0.56, 0.5, 0.8], (count, 3))
-    way = rng.normal(size=(count, 3))
-    ball = [0.3, 0.35, 0.4] + 0.1 * way / np.linalg.norm(way, axis=1)[:, None]
+    directions = rng.normal(size=(count, 3))
+    ball = [0.3, 0.35, 0.4] + 0.1 * directions / np.linalg.norm(directions, axis=1)[:, None]
     return np.concatenate([flat[: count // 3], wall[: count // 3], ball])[:count]
 
 
-def cloud(points: np.ndarray, **more: object) -> ik.Scene:
-    return ik.Scene({"seen": {"kind": "point-cloud", "points": points, "radius": RADIUS, **more}})
+def cloud(points: np.ndarray, **fields: object) -> ik.Scene:
+    return ik.Scene({"seen": {"kind": "point-cloud", "points": points, "radius": RADIUS, **fields}})
 
 
-def clearances(robot: ik.ArmHand, scene: ik.Scene, q: np.ndarray, **how: bool) -> np.ndarray:
+def clearances(robot: ik.ArmHand, scene: ik.Scene, q: np.ndarray, **options: bool) -> np.ndarray:
     """(k,) with everything that is checked [m]."""
-    found = ik.Solver(robot, scene=scene, **how).check(q, grasp_at(robot, robot.home))
-    assert found is not None
-    return found.distance
+    verdicts = ik.Solver(robot, scene=scene, **options).check(q, grasp_at(robot, robot.home))
+    assert verdicts is not None
+    return verdicts.distance
 
 
 def by_hand(robot: ik.ArmHand, points: np.ndarray, q: np.ndarray) -> np.ndarray:
     """(k,) least distance of the robot's capsules from balls about points [m]."""
-    links, found = robot.links(q), np.full(len(q), np.inf)
-    for one in robot.description.shapes.capsules:
-        if one.link == "base":
+    links, clearance = robot.links(q), np.full(len(q), np.inf)
+    for capsule in robot.description.shapes.capsules:
+        if capsule.link == "base":
             continue
-        pose = links[one.link]
-        middle = pose[:, :3, :3] @ one.center + pose[:, :3, 3]
-        half = pose[:, :3, :3] @ one.half
-        away = points - middle[:, None]
-        long = max(float(one.half @ one.half), 1e-30)
-        t = np.clip(np.einsum("kmi,ki->km", away, half) / long, -1, 1)
-        apart = np.linalg.norm(away - t[..., None] * half[:, None], axis=2).min(axis=1)
-        found = np.minimum(found, apart - one.radius - RADIUS)
-    return found
+        pose = links[capsule.link]
+        middle = pose[:, :3, :3] @ capsule.center + pose[:, :3, 3]
+        half_axis = pose[:, :3, :3] @ capsule.half
+        offsets = points - middle[:, None]
+        long = max(float(capsule.half @ capsule.half), 1e-30)
+        t = np.clip(np.einsum("kmi,ki->km", offsets, half_axis) / long, -1, 1)
+        separation = np.linalg.norm(offsets - t[..., None] * half_axis[:, None], axis=2).min(axis=1)
+        clearance = np.minimum(clearance, separation - capsule.radius - RADIUS)
+    return clearance
 
 
 def test_thousands_of_points_are_as_far_as_by_hand(robot, rng):
@@ -75,28 +75,40 @@ def test_a_cloud_is_its_balls_one_by_one(robot, rng):
         str(i): {"kind": "sphere", "radius": RADIUS, "xyz": point} for i, point in enumerate(points)
     }
     q = robot.random(rng, 60)
-    one, other = clearances(robot, cloud(points), q), clearances(robot, ik.Scene(balls), q)
-    np.testing.assert_allclose(one, other, atol=1e-12)
+    cloud_clearance, ball_clearance = (
+        clearances(robot, cloud(points), q),
+        clearances(robot, ik.Scene(balls), q),
+    )
+    np.testing.assert_allclose(cloud_clearance, ball_clearance, atol=1e-12)
     # The robot's capsules alone, which coal knows as they are: it never sees less room.
     import coal
 
-    shapes = [one for one in described(robot) if isinstance(one[1], coal.Capsule)]
+    shapes = [
+        cloud_clearance
+        for cloud_clearance in described(robot)
+        if isinstance(cloud_clearance[1], coal.Capsule)
+    ]
     ball, links = coal.Sphere(RADIUS), robot.links(q)
     for row in range(0, len(q), 6):
         for link, shape, pose in shapes:
             if link == "base":
                 continue
             for point in points:
-                there = np.eye(4)
-                there[:3, 3] = point
-                assert one[row] <= distance(shape, links[link][row] @ pose, ball, there) + 1e-6
+                cloud_pose = np.eye(4)
+                cloud_pose[:3, 3] = point
+                assert (
+                    cloud_clearance[row]
+                    <= distance(shape, links[link][row] @ pose, ball, cloud_pose) + 1e-6
+                )
 
 
 def test_numpy_says_the_same(robot, rng):
     scene = cloud(surfaces(rng, 2500), xyz=[0, 0, 0.05], rpy=[0.1, 0.2, 0.3])
     q = robot.random(rng, 40)
-    one, other = (clearances(robot, scene, q, compiled=how) for how in (True, False))
-    np.testing.assert_allclose(one, other, atol=3e-7)
+    compiled_clearance, numpy_clearance = (
+        clearances(robot, scene, q, compiled=is_compiled) for is_compiled in (True, False)
+    )
+    np.testing.assert_allclose(compiled_clearance, numpy_clearance, atol=3e-7)
 
 
 def test_what_is_thinned_is_never_farther(robot, rng):
@@ -120,15 +132,15 @@ def written(folder: Path, points: np.ndarray) -> list[Path]:
     head = "ply\nformat {}\ncomment made up\nelement vertex {}\nproperty uchar red\n"
     head += "".join(f"property double {axis}\n" for axis in "zxy")
     head += "element face 0\nproperty list uchar int vertex_indices\nend_header\n"
-    turned = points[:, [2, 0, 1]]
-    lines = "\n".join("7 " + " ".join(f"{v:.17g}" for v in row) for row in turned)
+    permuted = points[:, [2, 0, 1]]
+    lines = "\n".join("7 " + " ".join(f"{v:.17g}" for v in row) for row in permuted)
     (folder / "f.ply").write_text(head.format("ascii 1.0", len(points)) + lines + "\n")
     for name, form in (("g.ply", "<"), ("h.ply", ">")):
         word = {"<": "little", ">": "big"}[form]
         data = np.zeros(len(points), [("red", "u1"), ("p", f"{form}f8", 3)])
-        data["p"] = turned
-        said = head.format(f"binary_{word}_endian 1.0", len(points))
-        (folder / name).write_bytes(said.encode() + data.tobytes())
+        data["p"] = permuted
+        header = head.format(f"binary_{word}_endian 1.0", len(points))
+        (folder / name).write_bytes(header.encode() + data.tobytes())
     head = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z normal rgb\nSIZE 8 8 8 4 4\nTYPE F F F F U\n"
     head += f"COUNT 1 1 1 2 1\nWIDTH {len(points)}\nHEIGHT 1\nPOINTS {len(points)}\nDATA "
     (folder / "i.pcd").write_text(head + "ascii\n" + "\n".join(f"{row} 0 0 9" for row in rows))
@@ -162,7 +174,7 @@ def written(folder: Path, points: np.ndarray) -> list[Path]:
 
 def pack_lzf(data: bytes) -> bytes:
     """Compress as LZF does: literals of at most 32 bytes, and references to what came before."""
-    packed, literals, seen, place = bytearray(), bytearray(), dict[bytes, int](), 0
+    packed, literals, positions, place = bytearray(), bytearray(), dict[bytes, int](), 0
 
     def flush() -> None:
         for start in range(0, len(literals), 32):
@@ -173,11 +185,11 @@ def pack_lzf(data: bytes) -> bytes:
 
     while place < len(data):
         key = data[place : place + 3]
-        start, length = seen.get(key, -1), 0
-        seen[key] = place
+        start, length = positions.get(key, -1), 0
+        positions[key] = place
         if len(key) == 3 and start >= 0 and place - start <= 8192:
-            most = min(264, len(data) - place)
-            while length < most and data[start + length] == data[place + length]:
+            match_limit = min(264, len(data) - place)
+            while length < match_limit and data[start + length] == data[place + length]:
                 length += 1
         if length < 3:
             literals.append(data[place])
@@ -209,8 +221,8 @@ def test_every_file_gives_the_same_points(robot, rng, tmp_path):
         path.write_text(
             f"solids: {{seen: {{kind: point-cloud, file: files/{file.name}, radius: 10 mm}}}}\n"
         )
-        found = clearances(robot, ik.load_scene(path), q)
-        np.testing.assert_allclose(found, expected, atol=1e-12, err_msg=file.name)
+        values = clearances(robot, ik.load_scene(path), q)
+        np.testing.assert_allclose(values, expected, atol=1e-12, err_msg=file.name)
 
 
 HEAD = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 9\n"
@@ -257,7 +269,7 @@ def test_arrays_and_keys_that_do_not_fit(tmp_path):
     ):
         np.lib.format.write_array(stream, np.zeros((11_000_000, 3)))
     points = np.zeros((2, 3))
-    for more, message in (
+    for extra, message in (
         (
             {"points": np.zeros((2, 2))},
             r"found float64 of shape \(2, 2\), expected numbers",
@@ -273,7 +285,7 @@ def test_arrays_and_keys_that_do_not_fit(tmp_path):
         ({"points": np.random.default_rng(0).normal(size=(100_001, 3))}, "found 100001 points"),
     ):
         with pytest.raises(errors.DescriptionError, match=message) as caught:
-            ik.Scene({"seen": {"kind": "point-cloud", "radius": 0.01, **more}})
+            ik.Scene({"seen": {"kind": "point-cloud", "radius": 0.01, **extra}})
         assert str(caught.value).startswith("scene: solids.seen")
 
 
@@ -286,13 +298,13 @@ def test_answers_keep_off_a_cloud(rng):
     elbow = robot.links(bare.q)["lwr_link_4"][:3, 3]
     scene = cloud(elbow + rng.uniform(-0.05, 0.05, (2000, 3)))
     solver = ik.Solver(robot, scene=scene)
-    touched = solver.check(bare.q, grasp)
-    assert touched is not None
-    assert touched.distance.min() < 0
-    found = solver.solve(grasp)
-    assert found.success
-    assert found.clearance is not None
-    assert found.clearance >= -1e-9
+    verdict = solver.check(bare.q, grasp)
+    assert verdict is not None
+    assert verdict.distance.min() < 0
+    solution = solver.solve(grasp)
+    assert solution.success
+    assert solution.clearance is not None
+    assert solution.clearance >= -1e-9
     tips = np.array([contact.point for contact in grasp.contacts.values()])
     closed = cloud(tips.mean(axis=0) + rng.uniform(-0.3, 0.3, (2000, 3)))
     blocked = ik.Solver(robot, scene=closed).solve(grasp)
@@ -311,14 +323,14 @@ def test_poses_are_said_in_four_ways(robot, rng, tmp_path):
     first = ik.Scene({"a": {**box, "xyz": xyz, "rpy": rpy}})
     expected = clearances(robot, first, q)
     pose = first.items["a"].pose
-    for more in (
+    for pose_keys in (
         {"xyz": xyz, "quaternion_wxyz": [w, x, y, z]},
         {"xyz": xyz, "quaternion_xyzw": np.round([-x, -y, -z, -w], 4)},
         {"pose": pose},
         {"pose": pose.tolist()},
     ):
-        found = clearances(robot, ik.Scene({"a": {**box, **more}}), q)
-        np.testing.assert_allclose(found, expected, atol=1e-4)
+        values = clearances(robot, ik.Scene({"a": {**box, **pose_keys}}), q)
+        np.testing.assert_allclose(values, expected, atol=1e-4)
     path = tmp_path / "scene.yaml"
     path.write_text(
         "solids:\n  a:\n    kind: box\n    size: [300 mm, 100 mm, 200 mm]\n    pose:\n"
@@ -328,7 +340,7 @@ def test_poses_are_said_in_four_ways(robot, rng, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("pose_keys", "message"),
     [
         ({"rpy": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}, "found rpy and quaternion_wxyz, ex"),
         ({"pose": np.eye(4), "xyz": [0, 0, 0]}, "found pose and xyz, expected one of them"),
@@ -339,7 +351,7 @@ def test_poses_are_said_in_four_ways(robot, rng, tmp_path):
         ({"pose": np.eye(3)}, "pose"),
     ],
 )
-def test_poses_that_are_none(more, message):
+def test_poses_that_are_none(pose_keys, message):
     with pytest.raises(errors.DescriptionError, match=message) as caught:
-        ik.Scene({"a": {"kind": "box", "size": [1, 1, 1], **more}})
+        ik.Scene({"a": {"kind": "box", "size": [1, 1, 1], **pose_keys}})
     assert str(caught.value).startswith("scene: solids.a")

@@ -70,10 +70,10 @@ def test_moving_leaves_the_first_scene_alone():
     scene = ik.Scene({"a": BOX}, margin=0.01)
     pose = np.eye(4)
     pose[:3, 3] = [1, 2, 3]
-    moved = scene.moved("a", pose)
-    np.testing.assert_array_equal(moved.items["a"].pose, pose)
+    moved_scene = scene.moved("a", pose)
+    np.testing.assert_array_equal(moved_scene.items["a"].pose, pose)
     np.testing.assert_array_equal(scene.items["a"].pose, np.eye(4))
-    assert pickle.loads(pickle.dumps(moved)).margin == 0.01
+    assert pickle.loads(pickle.dumps(moved_scene)).margin == 0.01
     with pytest.raises(UnknownNameError, match=r"'b'"):
         scene.moved("b", pose)
     with pytest.raises(InputError, match="is not a rotation"):
@@ -82,11 +82,11 @@ def test_moving_leaves_the_first_scene_alone():
 
 def test_nothing_may_stand_in_the_base(tmp_path):
     robot = ik.load_robot(write_robot(tmp_path))
-    inside = {"post": {"kind": "box", "size": [0.1, 0.1, 0.1], "xyz": [0, 0, 0.1]}}
+    post_in_base = {"post": {"kind": "box", "size": [0.1, 0.1, 0.1], "xyz": [0, 0, 0.1]}}
     with pytest.raises(DescriptionError, match=r"solids.post:.*'base'"):
-        ik.Solver(robot, scene=ik.Scene(inside))
-    inside["post"]["xyz"][0] = 0.05 - 1e-5
+        ik.Solver(robot, scene=ik.Scene(post_in_base))
+    post_in_base["post"]["xyz"][0] = 0.05 - 1e-5
     with pytest.raises(DescriptionError, match=r"solids.post:.*'base'"):
-        ik.Solver(robot, scene=ik.Scene(inside))
+        ik.Solver(robot, scene=ik.Scene(post_in_base))
     with pytest.raises(DescriptionError, match=r"touching.*unknown 'moon'"):
         ik.Solver(robot, scene=ik.Scene(SCENE, touching=[{"links": ["moon", "l1"], "reason": "x"}]))

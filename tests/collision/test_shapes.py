@@ -54,7 +54,7 @@ def write_hand(folder: Path, right_2: str = '<sphere radius="0.01"/>') -> Path:
 
 def write_mesh(folder: Path, rng: np.random.Generator) -> np.ndarray:
     """A bent slab as an STL; its corners."""
-    x, y = (one.ravel() for one in np.meshgrid(np.linspace(-0.01, 0.01, 5), np.linspace(0, 1, 9)))
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.01, 0.01, 5), np.linspace(0, 1, 9)))
     top = np.column_stack([x, 0.02 * y * y, 0.05 * y]) + rng.normal(0, 1e-4, (45, 3))
     points = np.concatenate([top, top + np.array([0, 0.006, 0])])
     lines = ["solid slab"]
@@ -81,17 +81,19 @@ fingers:
 
 def test_shapes_come_with_the_parts(tmp_path):
     shapes = robots.load_description(write_robot(tmp_path)).shapes
-    assert [one.link for one in shapes.capsules if one.covers < 0] == [
+    assert [capsule.link for capsule in shapes.capsules if capsule.covers < 0] == [
         *("l1", "l3", "l3"),
         *("tip1", "tip2"),
     ]
-    assert [(one.link, one.kind) for one in shapes.solids] == [
+    assert [(capsule.link, capsule.kind) for capsule in shapes.solids] == [
         ("base", "cylinder"),
         ("l2", "box"),
         ("palm", "box"),
     ]
     covers = {
-        one.link: shapes.solids[one.covers].link for one in shapes.capsules if one.covers > -1
+        capsule.link: shapes.solids[capsule.covers].link
+        for capsule in shapes.capsules
+        if capsule.covers > -1
     }
     assert covers == {"base": "base", "l2": "l2", "palm": "palm"}
 
@@ -108,17 +110,19 @@ def test_shapes_come_with_the_parts(tmp_path):
 def test_capsules_hold_boxes_and_cylinders(shape, rng):
     unit = rng.uniform(-1, 1, (4000, 3))
     if isinstance(shape, LinkBoxEntry):
-        inside = unit * np.array(shape.size) / 2
+        corners = unit * np.array(shape.size) / 2
     else:
-        inside = unit[np.hypot(unit[:, 0], unit[:, 1]) <= 1]
-        inside = inside * [shape.radius, shape.radius, shape.length / 2]
+        corners = unit[np.hypot(unit[:, 0], unit[:, 1]) <= 1]
+        corners = corners * [shape.radius, shape.radius, shape.length / 2]
     pose = frame_matrix(Frame(shape.xyz, shape.rpy))
-    points = inside @ pose[:3, :3].T + pose[:3, 3]
-    apart = []
-    for center, half, radius in capsules_of(shape):
-        t = np.clip((points - center) @ half / max(half @ half, 1e-30), -1, 1)
-        apart.append(np.linalg.norm(points - center - t[:, None] * half, axis=1) - radius)
-    assert np.min(apart, axis=0).max() <= 1e-9
+    points = corners @ pose[:3, :3].T + pose[:3, 3]
+    separations = []
+    for center, half_axis, radius in capsules_of(shape):
+        t = np.clip((points - center) @ half_axis / max(half_axis @ half_axis, 1e-30), -1, 1)
+        separations.append(
+            np.linalg.norm(points - center - t[:, None] * half_axis, axis=1) - radius
+        )
+    assert np.min(separations, axis=0).max() <= 1e-9
 
 
 @pytest.mark.parametrize(
@@ -162,7 +166,7 @@ def test_an_srdf_says_what_may_touch(tmp_path):
         "<disable_collisions link1='base' link2='elsewhere' reason='Never'/></robot>"
     )
     excluded = collision_model(robots.load_description(path)).excluded
-    assert ("base", "l3", "three.srdf: Never") in [(*one.links, one.reason) for one in excluded]
+    assert ("base", "l3", "three.srdf: Never") in [(*pair.links, pair.reason) for pair in excluded]
 
 
 def test_a_robot_without_shapes_works_but_takes_no_scene(tmp_path):
@@ -194,10 +198,10 @@ def test_shipped_robots_stand_free_at_home(name):
     robot = ik.load_robot(name)
     check = SceneCheck(robot, ik.Scene(), compiled=False)
     points, normals = robot.contacts(robot.home)
-    asked = ik.Solver(robot, compiled=False)._request.of_arrays(points[None], normals[None], None)
-    found = check.collision_query(asked).check(robot.home[None])
-    assert found.free[0], found.pair(0)
-    assert all(one.reason for one in check.model.excluded)
+    batch = ik.Solver(robot, compiled=False)._request.of_arrays(points[None], normals[None], None)
+    verdict = check.collision_query(batch).check(robot.home[None])
+    assert verdict.free[0], verdict.pair(0)
+    assert all(pair.reason for pair in check.model.excluded)
 
 
 @pytest.mark.parametrize(
@@ -216,13 +220,17 @@ def test_shapes_hold_what_is_seen_of_an_arm(arm, link, corner):
     """The corners that stood out the most of shapes fitted to what is there for collisions."""
     shapes = ik.load_robot(f"{arm}+barrett_bh8_280").description.shapes
     point = np.array(corner) / 1e3
-    apart = []
-    for one in shapes.capsules:
-        if one.link == link:
-            square = one.half @ one.half
-            along = np.clip((point - one.center) @ one.half / square, -1, 1) if square else 0.0
-            apart.append(np.linalg.norm(point - one.center - along * one.half) - one.radius)
-    assert min(apart) < 1e-4
+    separations = []
+    for capsule in shapes.capsules:
+        if capsule.link == link:
+            square = capsule.half @ capsule.half
+            fraction = (
+                np.clip((point - capsule.center) @ capsule.half / square, -1, 1) if square else 0.0
+            )
+            separations.append(
+                np.linalg.norm(point - capsule.center - fraction * capsule.half) - capsule.radius
+            )
+    assert min(separations) < 1e-4
 
 
 def test_a_description_reads_simple_shapes_of_its_file(tmp_path: Path) -> None:
@@ -230,19 +238,24 @@ def test_a_description_reads_simple_shapes_of_its_file(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(DESCRIPTION)
     shapes = robots.load_description(path).shapes
-    assert [(one.link, one.kind, one.size.tolist()) for one in shapes.solids] == [
+    assert [(solid.link, solid.kind, solid.size.tolist()) for solid in shapes.solids] == [
         ("palm", "box", [0.1, 0.06, 0.02]),
         ("left_1", "cylinder", [0.01, 0.05, 0.0]),
         ("left_2", "cylinder", [0.008, 0.04, 0.0]),
     ]
-    spheres = [one for one in shapes.capsules if one.covers < 0]
-    assert [(one.link, one.radius) for one in spheres] == [("right_1", 0.012), ("right_2", 0.01)]
+    spheres = [solid for solid in shapes.capsules if solid.covers < 0]
+    assert [(solid.link, solid.radius) for solid in spheres] == [
+        ("right_1", 0.012),
+        ("right_2", 0.01),
+    ]
     np.testing.assert_allclose(spheres[0].center, [0, 0, 0.02])
     # What the description says of a link goes before its file.
-    own = "collision: {links: {palm: [{kind: sphere, radius: 5 cm}]}}\n"
-    path.write_text(DESCRIPTION + own)
-    palm = [one for one in robots.load_description(path).shapes.capsules if one.link == "palm"]
-    assert [one.radius for one in palm] == [0.05]
+    collision_text = "collision: {links: {palm: [{kind: sphere, radius: 5 cm}]}}\n"
+    path.write_text(DESCRIPTION + collision_text)
+    palm = [
+        solid for solid in robots.load_description(path).shapes.capsules if solid.link == "palm"
+    ]
+    assert [solid.radius for solid in palm] == [0.05]
 
 
 def test_meshes_that_nobody_fitted_are_no_shapes(tmp_path: Path, rng) -> None:
@@ -264,30 +277,44 @@ def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
         "<disable_collisions link1='left_2' link2='right_2' reason='Never'/></robot>"
     )
     out = tmp_path / "mine.yaml"
-    found = robot_import.import_robot(None, hand, out, command="casadi-ik import")
-    out.write_text(found.description.to_yaml())
-    found = found.with_home(out).with_shapes(out, tmp_path / "hand.srdf")
-    out.write_text(found.description.to_yaml())
+    report = robot_import.import_robot(None, hand, out, command="casadi-ik import")
+    out.write_text(report.description.to_yaml())
+    report = report.with_home(out).with_shapes(out, tmp_path / "hand.srdf")
+    out.write_text(report.description.to_yaml())
     entry = yaml.safe_load(out.read_text())["collision"]
     assert entry["links"]["left_1"][0]["kind"] == "cylinder"
     assert entry["links"]["left_1"][0]["radius"] == "10 mm"
     fitted = entry["links"]["right_2"]
-    assert {one["kind"] for one in fitted} <= {"capsule", "sphere"}
+    assert {shape_entry["kind"] for shape_entry in fitted} <= {"capsule", "sphere"}
     excess = float(fitted[0]["excess"].removesuffix(" mm"))
     assert 0 < excess < 20
     description = robots.load_description(out)
     # In the link's frame the mesh is turned as the file has it.
     pose = frame_matrix(Frame((0, 0, 0.02), (0.3, 0.2, 0.1)))
     mesh = points @ pose[:3, :3].T + pose[:3, 3]
-    apart = np.full(len(mesh), np.inf)
-    for one in description.shapes.capsules:
-        if one.link == "right_2":
-            t = np.clip((mesh - one.center) @ one.half / max(one.half @ one.half, 1e-30), -1, 1)
-            gap = np.linalg.norm(mesh - one.center - t[:, None] * one.half, axis=1) - one.radius
-            apart = np.minimum(apart, gap)
-    assert apart.max() <= 0
-    assert sum(one.link == "right_2" for one in description.shapes.capsules) == len(fitted)
-    excluded = {frozenset(one.links): one.reason for one in collision_model(description).excluded}
+    separation = np.full(len(mesh), np.inf)
+    for shape_entry in description.shapes.capsules:
+        if shape_entry.link == "right_2":
+            t = np.clip(
+                (mesh - shape_entry.center)
+                @ shape_entry.half
+                / max(shape_entry.half @ shape_entry.half, 1e-30),
+                -1,
+                1,
+            )
+            gap = (
+                np.linalg.norm(mesh - shape_entry.center - t[:, None] * shape_entry.half, axis=1)
+                - shape_entry.radius
+            )
+            separation = np.minimum(separation, gap)
+    assert separation.max() <= 0
+    assert sum(shape_entry.link == "right_2" for shape_entry in description.shapes.capsules) == len(
+        fitted
+    )
+    excluded = {
+        frozenset(shape_entry.links): shape_entry.reason
+        for shape_entry in collision_model(description).excluded
+    }
     assert excluded[frozenset(("left_2", "right_2"))] == "hand.srdf: Never"
     assert SceneCheck(ik.ArmHand(description), ik.Scene(), compiled=False).model.pairs.size
 
@@ -311,21 +338,23 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
 def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
     """The same as every sample against every point, and every corner held."""
     rng = np.random.default_rng(0)
-    turned, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     low, high = np.array([-0.05, -0.02, -0.1]), np.array([0.05, 0.03, 0.1])
-    corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)]) @ turned
+    corners = (
+        np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)]) @ rotation
+    )
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6)]
     triangles = corners[np.array([*faces, (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])]
-    found, beyond = capsules.fit(triangles, 3)
+    fitted, overhang = capsules.fit(triangles, 3)
     points, numbers = capsules.cut(triangles)
-    held = np.min([one.distances_to(points) for one in found], axis=0)
-    assert held.max() <= 1e-12
-    skin = np.concatenate([one.surface_points() for one in found])
-    skin = skin[np.min([one.distances_to(skin) for one in found], axis=0) >= -1e-6]
-    every = np.concatenate([points, points[numbers].mean(axis=1)])
-    nearest = np.linalg.norm(skin[:, None] - every, axis=2).min(axis=1)
-    assert beyond == pytest.approx(nearest.max(), abs=1e-9)
-    assert len(found) > 1
+    distances = np.min([capsule.distances_to(points) for capsule in fitted], axis=0)
+    assert distances.max() <= 1e-12
+    skin = np.concatenate([capsule.surface_points() for capsule in fitted])
+    skin = skin[np.min([capsule.distances_to(skin) for capsule in fitted], axis=0) >= -1e-6]
+    samples = np.concatenate([points, points[numbers].mean(axis=1)])
+    nearest = np.linalg.norm(skin[:, None] - samples, axis=2).min(axis=1)
+    assert overhang == pytest.approx(nearest.max(), abs=1e-9)
+    assert len(fitted) > 1
 
 
 def test_a_fine_mesh_is_simplified_by_less_than_a_cell_and_enclosed_as_a_whole():
@@ -336,22 +365,24 @@ def test_a_fine_mesh_is_simplified_by_less_than_a_cell_and_enclosed_as_a_whole()
     assert 500 < len(coarse.triangles) < len(mesh.triangles) / 2
     distances, _ = KDTree(coarse.points).query(mesh.points)
     assert distances.max() <= np.sqrt(3) * 0.08 / 40
-    found, beyond = capsules.fit(mesh.points[mesh.triangles], 1)
-    assert found[0].distances_to(mesh.points).max() <= 0
-    assert found[0].radius < 0.0215
-    assert beyond < 0.006
+    fitted, overhang = capsules.fit(mesh.points[mesh.triangles], 1)
+    assert fitted[0].distances_to(mesh.points).max() <= 0
+    assert fitted[0].radius < 0.0215
+    assert overhang < 0.006
 
 
 def test_shapes_come_back_from_the_urdf(tmp_path):
     robot = ik.load_robot(write_robot(tmp_path))
     text = robot.urdf()
     model = pinocchio.buildModelFromXML(text)
-    found = pinocchio.buildGeomFromUrdfString(model, text, pinocchio.GeometryType.COLLISION)
-    kinds = sorted(type(one.geometry).__name__ for one in found.geometryObjects)
+    geometry = pinocchio.buildGeomFromUrdfString(model, text, pinocchio.GeometryType.COLLISION)
+    kinds = sorted(type(item.geometry).__name__ for item in geometry.geometryObjects)
     # Four capsules of a cylinder and two spheres each, a sphere, two boxes and a cylinder.
     assert kinds == ["Box"] * 2 + ["Cylinder"] * 5 + ["Sphere"] * 9
-    box = next(one for one in found.geometryObjects if model.frames[one.parentFrame].name == "l2")
+    box = next(
+        item for item in geometry.geometryObjects if model.frames[item.parentFrame].name == "l2"
+    )
     place = (model.frames[box.parentFrame].placement.inverse() * box.placement).homogeneous
-    solid = next(one for one in robot.description.shapes.solids if one.link == "l2")
+    solid = next(item for item in robot.description.shapes.solids if item.link == "l2")
     np.testing.assert_allclose(place, solid.pose, atol=1e-12)
     np.testing.assert_allclose(2 * np.asarray(box.geometry.halfSide), solid.size, atol=1e-12)

@@ -18,14 +18,14 @@ def test_what_is_said_to_help_does(robot) -> None:
     solver = ik.Solver(robot, scene=ik.Scene({"ball": ball}))
     solution = solver.solve(cup)
     assert solution.status is ik.Status.COLLISION
-    found = solution.collision.way_out
-    assert 0 < np.linalg.norm(found.moved) <= found.farthest
+    remedies = solution.collision.way_out
+    assert 0 < np.linalg.norm(remedies.moved) <= remedies.farthest
     pose = cup.object_pose.copy()
-    pose[:3, 3] += found.moved
+    pose[:3, 3] += remedies.moved
     assert solver.solve(cup.in_object_frame().at(pose)).success
     lines = "\n".join(solution.collision.lines)
-    assert f"moved by {1e3 * np.linalg.norm(found.moved):.0f} mm" in lines
-    for name in found.fewer:
+    assert f"moved by {1e3 * np.linalg.norm(remedies.moved):.0f} mm" in lines
+    for name in remedies.fewer:
         fewer = {key: c for key, c in cup.contacts.items() if key != name}
         assert solver.solve(dataclasses.replace(cup, contacts=fewer)).success
         assert name in lines
@@ -41,30 +41,30 @@ def test_an_object_is_not_moved_into_the_table() -> None:
             "pole": {"kind": "capsule", "radius": 0.01, "length": 0.2, "xyz": [0.1, 0, 0.1]},
         }
     )
-    others = [item for name, item in scene.items.items() if name != "cup"]
+    other_items = [item for name, item in scene.items.items() if name != "cup"]
     shifts = np.array([[0, 0, 0.02], [0, 0, -0.02], [0, 0.17, 0.02], [0.06, 0, 0.05]])
     poses = np.repeat(scene.items["cup"].pose[None], 5, axis=0)
     poses[:4, :3, 3] += shifts
     poses[4, :3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # it lies on the air, 40 mm thick below
-    found = gaps(scene.items["cup"], others, poses)
-    np.testing.assert_allclose(found, [0.02, -0.02, -0.01, -0.01, 0.01], atol=2e-3)
+    distances = gaps(scene.items["cup"], other_items, poses)
+    np.testing.assert_allclose(distances, [0.02, -0.02, -0.01, -0.01, 0.01], atol=2e-3)
 
 
 def test_margins_of_single_pairs(robot) -> None:
     """A pair's own margin goes before the solid's and the scene's; the clearance stays true."""
     post = {"kind": "box", "size": [0.1, 0.1, 0.4], "xyz": [0.5, 0.5, 0.2], "margin": 0.03}
-    less = [{"links": ["lwr_link_6", "post"], "margin": 0.002}]
+    smaller_margins = [{"links": ["lwr_link_6", "post"], "margin": 0.002}]
     clearances = []
-    for margins, kept in (((), 0.03), (less, 0.002)):
+    for margins, expected_margin in (((), 0.03), (smaller_margins, 0.002)):
         scene = ik.Scene({"post": post}, margin=0.01, margins=margins)
         solver = ik.Solver(robot, scene=scene, compiled=False)
         around = solver._engine.collision_query(
             solver._request.of_grasps([ik.load_grasp("cup")], None)
         )
         of_pair = np.array([set(names) == {"lwr_link_6", "post"} for names in around.table.names])
-        found = around.with_table(around.table.select(of_pair)).check(robot.home[None])
-        clearances.append(float(found.distance[0]))
-        assert found.surplus[0] == pytest.approx(found.distance[0] - kept)
+        verdict = around.with_table(around.table.select(of_pair)).check(robot.home[None])
+        clearances.append(float(verdict.distance[0]))
+        assert verdict.surplus[0] == pytest.approx(verdict.distance[0] - expected_margin)
     assert clearances[0] == pytest.approx(clearances[1])
 
 

@@ -44,9 +44,9 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
     points = points @ np.swapaxes(back[:, :3, :3], 1, 2) + back[:, None, :3, 3]
     normals = normals @ np.swapaxes(back[:, :3, :3], 1, 2)
     for i, grasp in enumerate(ik.load_candidates(written.path, robot, take="contacts")):
-        found = grasp.arrays(robot.fingers)
-        assert found[0] == pytest.approx(points[i], abs=3e-6)
-        assert found[1] == pytest.approx(normals[i], abs=3e-6)
+        arrays = grasp.arrays(robot.fingers)
+        assert arrays[0] == pytest.approx(points[i], abs=3e-6)
+        assert arrays[1] == pytest.approx(normals[i], abs=3e-6)
 
 
 @pytest.mark.parametrize("name", sorted(PUBLISHED))
@@ -55,10 +55,12 @@ def test_conventions_agree_with_the_published_hands(name: str) -> None:
     published, convention = PUBLISHED[name], load_convention(name)
     described = ik.load_robot(ROBOTS.get(name.split("_")[1], KUKA)).description
     values = np.array([list(published["joints"].values())])
-    given = HandPoses("", np.zeros((1, 3)), np.eye(3)[None], values, tuple(published["joints"]))
-    positions = {name: float(value[0]) for name, value in convention.positions(given).items()}
+    hand_poses = HandPoses(
+        "", np.zeros((1, 3)), np.eye(3)[None], values, tuple(published["joints"])
+    )
+    positions = {name: float(value[0]) for name, value in convention.positions(hand_poses).items()}
     poses = link_poses(described.root, described.joints, positions)
-    back = convention.frames(given)[0] @ np.linalg.inv(poses[convention.link])
+    back = convention.frames(hand_poses)[0] @ np.linalg.inv(poses[convention.link])
     children = {joint.name: joint.child for joint in described.joints}
     # The little finger of DexGraspNet's model begins 1.7 mm beside the hand's.
     within = 2e-3 if name == "dexgraspnet_shadow" else 1.5e-4
@@ -90,8 +92,10 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     place[:3, 3] = 0.1, -0.2, 0.05
     ranked = solver.choose([grasp.at(np.linalg.inv(place)) for grasp in grasps], place, limit=40)
     assert ranked.answered == len(grasps)
-    for one in ranked:
-        assert robot.palm(one.solution.q) == pytest.approx(grasps[one.candidate].palm, abs=1e-3)
+    for choice in ranked:
+        assert robot.palm(choice.solution.q) == pytest.approx(
+            grasps[choice.candidate].palm, abs=1e-3
+        )
     rpy = [0.3, -0.2, 1.0]
     text = "\n".join(f"  {name}: {value!r}" for name, value in grasps[0].posture.items())
     (tmp_path / "palm.yaml").write_text(
@@ -99,22 +103,24 @@ def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
     )
     loaded = ik.load_grasp(tmp_path / "palm.yaml")
     assert solver.solve(loaded).palm is not None
-    far = grasps[0].at(np.block([[np.eye(3), np.array([[3.0], [0], [0]])], [0, 0, 0, 1.0]]))
-    missed = solver.solve(far)
+    far_grasp = grasps[0].at(np.block([[np.eye(3), np.array([[3.0], [0], [0]])], [0, 0, 0, 1.0]]))
+    missed = solver.solve(far_grasp)
     assert missed.status is ik.Status.UNREACHABLE
     assert missed.palm is not None
     assert not missed.palm.ok
     assert missed.diagnosis is not None
     assert missed.diagnosis.palm is not None
     assert missed.diagnosis.palm.position_error > 1
-    said = reasons(missed)
+    reason_text = reasons(missed)
     assert missed.diagnosis.proof is not None
-    assert any("palm" in line for line in said)
-    assert not any(finger in line for line in said for finger in (*robot.fingers, "contact"))
-    assert far.palm is not None
-    (again,) = solver.solve_palms(far.palm[None], far.posture, diagnose=True).diagnoses
-    assert again is not None
-    assert again.palm is not None
+    assert any("palm" in line for line in reason_text)
+    assert not any(finger in line for line in reason_text for finger in (*robot.fingers, "contact"))
+    assert far_grasp.palm is not None
+    (diagnosis,) = solver.solve_palms(
+        far_grasp.palm[None], far_grasp.posture, diagnose=True
+    ).diagnoses
+    assert diagnosis is not None
+    assert diagnosis.palm is not None
 
 
 def test_many_palms() -> None:
@@ -130,8 +136,8 @@ def test_many_palms() -> None:
     assert batch.palm_ok is not None
     assert batch.palm_ok.all()
     assert batch.q[:, columns] == pytest.approx(q[:, columns], abs=1e-9)
-    again = solver.solve_palms(robot.palm(q), hands, jobs=2)
-    np.testing.assert_array_equal(again.q, batch.q)
+    parallel_batch = solver.solve_palms(robot.palm(q), hands, jobs=2)
+    np.testing.assert_array_equal(parallel_batch.q, batch.q)
     with pytest.raises(ik.CasadiIKError, match=r"postures:.*3\.bh_spread:.*9\.0"):
         solver.solve_palms(robot.palm(q), hands | {"bh_spread": [0.1] * 3 + [9.0] + [0.1] * 56})
     with pytest.raises(ik.CasadiIKError, match=r"postures\.bh_spread:.*60"):
@@ -139,7 +145,7 @@ def test_many_palms() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("options", "says"),
     [
         ({"palm": np.eye(4)}, "posture: missing"),
         (
@@ -156,9 +162,9 @@ def test_many_palms() -> None:
         ),
     ],
 )
-def test_bad_palms(given: dict[str, Any], says: str) -> None:
+def test_bad_palms(options: dict[str, Any], says: str) -> None:
     with pytest.raises(ik.CasadiIKError, match=says):
-        ik.Grasp(**given)
+        ik.Grasp(**options)
 
 
 @pytest.mark.parametrize(
@@ -184,9 +190,11 @@ def _table(tmp_path: Path, **changes: Any) -> Path:
     columns: dict[str, Any] = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.1)
     columns |= dict.fromkeys(robot.description.finger_motors, 0.5)
     columns |= changes
-    kept = {name: value for name, value in columns.items() if value is not None}
+    columns_left = {name: value for name, value in columns.items() if value is not None}
     path = tmp_path / "grasps.csv"
-    path.write_text(",".join(kept) + "\n" + ",".join(map(str, kept.values())) + "\n")
+    path.write_text(
+        ",".join(columns_left) + "\n" + ",".join(map(str, columns_left.values())) + "\n"
+    )
     return path
 
 
@@ -215,8 +223,8 @@ def test_columns_that_are_not_joints(suffix: str, tmp_path: Path) -> None:
     """As pandas writes a table: its index, a score, a note, and a cell that is empty."""
     path = _table(tmp_path)
     head, row = path.read_text().splitlines()
-    more = ["0,{},0.9,good", "1,{},0.8,bad", "2,{},,good"]
-    rows = [text.format(row) for text in more]
+    lines = ["0,{},0.9,good", "1,{},0.8,bad", "2,{},,good"]
+    rows = [text.format(row) for text in lines]
     rows[1] = rows[1].replace("0.1", "", 1)
     path.write_text("\n".join([f",{head},Score,label", *rows]) + "\n")
     if suffix == "parquet":
@@ -295,7 +303,7 @@ def test_another_hand(tmp_path: Path) -> None:
 SIZES = (0.06, 0.08, 0.1, 0.12, 0.15)
 
 
-def _dexgraspnet(tmp_path: Path, beyond: int = 0) -> Written:
+def _dexgraspnet(tmp_path: Path, rows_beyond_limits: int = 0) -> Written:
     """A file as the data set has them: distal joints free, five sizes of the object by turns."""
     written = made("dexgraspnet_shadow", tmp_path)
     entries, rng = np.load(written.path, allow_pickle=True), np.random.default_rng(1)
@@ -303,7 +311,7 @@ def _dexgraspnet(tmp_path: Path, beyond: int = 0) -> Written:
         for finger in ("FF", "MF", "RF", "LF"):
             entry["qpos"] |= {f"robot0:{finger}J{n}": rng.uniform(0, 1.5) for n in (0, 1)}
         entry |= {"scale": SIZES[i % 5], "qpos_st": dict(entry["qpos"]), "energy": 1.0}
-        entry["qpos"]["robot0:THJ2"] += 0.5 * (i < beyond)
+        entry["qpos"]["robot0:THJ2"] += 0.5 * (i < rows_beyond_limits)
     np.save(written.path, entries)
     return written
 
@@ -324,8 +332,8 @@ def test_joints_that_are_free_in_the_data(tmp_path: Path) -> None:
     assert grasps.rows == (0, 5)
     assert grasps.scale == SIZES[0]
     assert grasps[1].name == "dexgraspnet_shadow[5]"
-    asked = ik.load_candidates(written.path, robot, scale=SIZES[0], take="contacts")
-    for grasp, contacts, shift in zip(grasps, asked, grasps.shift, strict=True):
+    candidates = ik.load_candidates(written.path, robot, scale=SIZES[0], take="contacts")
+    for grasp, contacts, shift in zip(grasps, candidates, grasps.shift, strict=True):
         palm = grasp.palm
         assert palm is not None
         theirs = (contacts.arrays(robot.fingers)[0] - palm[:3, 3]) @ palm[:3, :3]
@@ -338,11 +346,13 @@ def test_joints_that_are_free_in_the_data(tmp_path: Path) -> None:
             [0.01, 0.1], (4000, 1)
         )
         columns = [robot.actuators.index(name) for name in grasp.posture]
-        others = _tips(robot, grasp, np.clip(around, robot.lower[columns], robot.upper[columns]))
-        assert (np.linalg.norm(others - theirs, axis=2).min(axis=0) >= off - 2e-5).sum() >= 4
-        assert ((others - theirs) ** 2).sum(axis=(1, 2)).min() >= (off**2).sum() - 1e-9
-    moved = [one for one in grasps.shift if one > 1e-4]
-    assert any("shifted" in note for note in grasps.notes) == bool(moved)
+        tips_nearby = _tips(
+            robot, grasp, np.clip(around, robot.lower[columns], robot.upper[columns])
+        )
+        assert (np.linalg.norm(tips_nearby - theirs, axis=2).min(axis=0) >= off - 2e-5).sum() >= 4
+        assert ((tips_nearby - theirs) ** 2).sum(axis=(1, 2)).min() >= (off**2).sum() - 1e-9
+    shifts = [shift_norm for shift_norm in grasps.shift if shift_norm > 1e-4]
+    assert any("shifted" in note for note in grasps.notes) == bool(shifts)
 
 
 def test_sizes_of_an_object(tmp_path: Path) -> None:
@@ -360,26 +370,28 @@ def test_sizes_of_an_object(tmp_path: Path) -> None:
 
 def test_rows_beyond_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Rows beyond limits are refused, dropped or clipped, and counted."""
-    written = _dexgraspnet(tmp_path, beyond=1)
-    given = {"path": written.path, "robot": written.robot, "scale": SIZES[0]}
+    written = _dexgraspnet(tmp_path, rows_beyond_limits=1)
+    options = {"path": written.path, "robot": written.robot, "scale": SIZES[0]}
     says = r"row 0: shadow_thj3: found .*; 1 of 2 rows are invalid; invalid='drop'.*'clip'.*--inv"
     with pytest.raises(ik.errors.DescriptionError, match=says) as caught:
-        ik.load_candidates(**given)
+        ik.load_candidates(**options)
     assert "\n" not in str(caught.value)
-    whole = ik.load_candidates(**given, invalid="clip")
-    assert (len(whole), whole.dropped, whole.clipped) == (2, 0, 1)
+    clipped = ik.load_candidates(**options, invalid="clip")
+    assert (len(clipped), clipped.dropped, clipped.clipped) == (2, 0, 1)
     at = written.robot.actuators.index("shadow_thj3")
-    assert whole[0].posture["shadow_thj3"] == written.robot.upper[at]
-    assert whole.shift[0] > 1e-3
-    assert "1 of 2 rows" in str(whole)
-    fewer = ik.load_candidates(**given, invalid="drop")
+    assert clipped[0].posture["shadow_thj3"] == written.robot.upper[at]
+    assert clipped.shift[0] > 1e-3
+    assert "1 of 2 rows" in str(clipped)
+    fewer = ik.load_candidates(**options, invalid="drop")
     assert (fewer.rows, fewer.dropped, fewer.clipped) == ((5,), 1, 0)
     assert "1 of 2 rows dropped" in str(fewer)
-    again = _dexgraspnet(tmp_path, beyond=2)
+    written_beyond = _dexgraspnet(tmp_path, rows_beyond_limits=2)
     with pytest.raises(ik.errors.DescriptionError, match=r"1: shadow_thj3: .*; 1.*1"):
-        ik.load_candidates(again.path, again.robot, scale=SIZES[1], invalid="drop")
+        ik.load_candidates(
+            written_beyond.path, written_beyond.robot, scale=SIZES[1], invalid="drop"
+        )
     with pytest.raises(ik.CasadiIKError, match=r"invalid:.*'no'"):
-        ik.load_candidates(**given, invalid="no")  # pyright: ignore[reportArgumentType]
+        ik.load_candidates(**options, invalid="no")  # pyright: ignore[reportArgumentType]
     words = ["choose", str(written.path), "--robot", "ur5e+shadow", "--out", str(tmp_path / "r")]
     assert main([*words, "--scale", "0.06"]) == 2
     assert "--invalid" in capsys.readouterr().err
@@ -415,27 +427,27 @@ def test_stages_before_and_after(name: str, tmp_path: Path) -> None:
     written = made(name, tmp_path)
     place = np.eye(4)
     place[:3, 3] = 0.4, 0.1, 0.2
-    found = ik.load_candidates(written.path, written.robot, object_pose=place)
+    candidates = ik.load_candidates(written.path, written.robot, object_pose=place)
     robot = written.robot
-    for grasp, q in zip(found, written.q, strict=True):
-        before, after = grasp.pregrasp, grasp.squeeze
-        assert before is not None
+    for grasp, q in zip(candidates, written.q, strict=True):
+        pregrasp, after = grasp.pregrasp, grasp.squeeze
+        assert pregrasp is not None
         assert after is not None
         assert after.palm is not None
-        for motor, position in before.posture.items():
+        for motor, position in pregrasp.posture.items():
             i = robot.actuators.index(motor)
-            half, twice = (
+            halves, twice = (
                 np.clip(share * q[i], robot.lower[i], robot.upper[i]) for share in (0.5, 2)
             )
-            assert position == pytest.approx(half, abs=1e-6)
+            assert position == pytest.approx(halves, abs=1e-6)
             assert after.posture[motor] == pytest.approx(twice, abs=1e-6)
     still = ik.load_candidates(written.path, robot)
-    assert found[0].pregrasp is not None
+    assert candidates[0].pregrasp is not None
     assert still[0].pregrasp is not None
     assert still[0].pregrasp.palm is not None
-    assert found[0].pregrasp.palm == pytest.approx(place @ still[0].pregrasp.palm)
-    again = pickle.loads(pickle.dumps(found[0]))
-    assert again.squeeze.posture == found[0].squeeze.posture
+    assert candidates[0].pregrasp.palm == pytest.approx(place @ still[0].pregrasp.palm)
+    restored = pickle.loads(pickle.dumps(candidates[0]))
+    assert restored.squeeze.posture == candidates[0].squeeze.posture
 
 
 class _Runs:
@@ -472,20 +484,20 @@ def test_nothing_in_a_pickle_is_run(build: Any, tmp_path: Path) -> None:
 def test_damaged_pickles(name: str, tmp_path: Path) -> None:
     """Every cut and many changes of a file end in one line, or in grasps."""
     written = made(name, tmp_path).path
-    whole, path = written.read_bytes(), tmp_path / f"cut{written.suffix}"
+    pickled, path = written.read_bytes(), tmp_path / f"cut{written.suffix}"
     robot, rng = ik.load_robot("panda+allegro_right"), np.random.default_rng(0)
-    begun = whole.index(pickle.PROTO, 10)
+    begun = pickled.index(pickle.PROTO, 10)
     for trial in range(150):
-        data = bytearray(whole)
+        data = bytearray(pickled)
         if trial % 3 == 0:
             del data[int(rng.integers(len(data))) :]
         else:
             for place in rng.integers(begun, begun + 700, 3):
                 data[place] = int(rng.integers(256))
         path.write_bytes(bytes(data))
-        said = ""
+        error_text = ""
         try:
             ik.load_candidates(path, robot)
         except ik.CasadiIKError as error:
-            said = str(error)
-        assert "\n" not in said
+            error_text = str(error)
+        assert "\n" not in error_text

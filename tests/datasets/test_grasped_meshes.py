@@ -29,8 +29,8 @@ def _arch() -> list[trimesh.Trimesh]:
 
 
 def _written(path: Path, parts: list[trimesh.Trimesh]) -> Path:
-    whole: Any = trimesh.util.concatenate(parts)
-    whole.export(path)
+    mesh: Any = trimesh.util.concatenate(parts)
+    mesh.export(path)
     return path
 
 
@@ -53,11 +53,13 @@ def _grasp_file(folder: Path, thumb_at: np.ndarray) -> Path:
 def test_distances_are_those_of_the_body(kind: str, tmp_path: Path) -> None:
     """Two boxes that touch are one: what is between them is inside; a hole is outside."""
     halves = [_box((0.1, 0.12, 0.08), (side * 0.05, 0.0, 0.0)) for side in (-1, 1)]
-    one = grasps.load_object(_written(tmp_path / f"a.{kind}", [_box((0.2, 0.12, 0.08), (0, 0, 0))]))
+    body = grasps.load_object(
+        _written(tmp_path / f"a.{kind}", [_box((0.2, 0.12, 0.08), (0, 0, 0))])
+    )
     two = grasps.load_object(_written(tmp_path / f"b.{kind}", halves))
     points = np.random.default_rng(0).uniform(-0.15, 0.15, (300, 3))
     exact = grasps.Box(size=(0.2, 0.12, 0.08), source="").signed_distance(points)
-    assert one.signed_distance(points) == pytest.approx(exact, abs=1e-7)
+    assert body.signed_distance(points) == pytest.approx(exact, abs=1e-7)
     assert two.signed_distance(points) == pytest.approx(exact, abs=1e-7)
     assert len(ik.Scene().holding(two.name, np.eye(4)).items[two.name].parts) == 2
     handle = grasps.load_object(_written(tmp_path / f"c.{kind}", _arch()))
@@ -68,32 +70,32 @@ def test_distances_are_those_of_the_body(kind: str, tmp_path: Path) -> None:
 
 def test_pads_touch_the_mesh(tmp_path: Path) -> None:
     """A mesh counts as its surface, not as its hull; several files are one object."""
-    whole = _written(tmp_path / "handle.obj", _arch())
+    mesh = _written(tmp_path / "handle.obj", _arch())
     files = [_written(tmp_path / f"{i}.stl", [part]) for i, part in enumerate(_arch())]
     path = _grasp_file(tmp_path, 0.1 * np.array([0.49, 0.0, 0.0]))
-    meant = f"{whole}@0.1"
-    (grasp,) = ik.load_candidates(path, ROBOT, take="contacts", grasped=meant)
+    scaled_source = f"{mesh}@0.1"
+    (grasp,) = ik.load_candidates(path, ROBOT, take="contacts", grasped=scaled_source)
     contact = grasp.contacts["thumb"]
     assert contact.point == pytest.approx([0.05, 0.0, 0.0], abs=1e-6)
     assert contact.normal == pytest.approx([1.0, 0.0, 0.0], abs=1e-6)
-    assert grasp.object == meant
+    assert grasp.object == scaled_source
     large = _grasp_file(tmp_path, np.array([0.495, 0.0, 0.0]))
-    (several,) = ik.load_candidates(large, ROBOT, take="contacts", grasped=files)
-    assert several.contacts["thumb"].point == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
+    (grasp_set,) = ik.load_candidates(large, ROBOT, take="contacts", grasped=files)
+    assert grasp_set.contacts["thumb"].point == pytest.approx([0.5, 0.0, 0.0], abs=1e-6)
     within = _grasp_file(tmp_path, np.zeros(3))
     with pytest.raises(ik.errors.DescriptionError, match=r"10.*handle.obj"):
-        ik.load_candidates(within, ROBOT, take="contacts", grasped=whole)
+        ik.load_candidates(within, ROBOT, take="contacts", grasped=mesh)
 
 
 def test_a_mesh_is_as_large_as_the_data_say(tmp_path: Path) -> None:
     written = made("bodex_allegro", tmp_path)  # obj_scale 0.06
     ball: Any = trimesh.creation.icosphere(3, 1.0)
     ball.export(tmp_path / "ball.obj")
-    found = ik.load_candidates(written.path, written.robot, grasped=tmp_path / "ball.obj")
-    assert {grasp.object for grasp in found} == {f"{tmp_path / 'ball.obj'}@0.06"}
-    assert grasps.load_object(found[0].object).signed_distance([0.0, 0.0, 0.1]) == pytest.approx(
-        0.04, abs=1e-4
-    )
+    candidates = ik.load_candidates(written.path, written.robot, grasped=tmp_path / "ball.obj")
+    assert {grasp.object for grasp in candidates} == {f"{tmp_path / 'ball.obj'}@0.06"}
+    assert grasps.load_object(candidates[0].object).signed_distance(
+        [0.0, 0.0, 0.1]
+    ) == pytest.approx(0.04, abs=1e-4)
 
 
 def test_collisions_with_convex_parts(robot: ik.ArmHand, tmp_path: Path) -> None:
@@ -104,14 +106,14 @@ def test_collisions_with_convex_parts(robot: ik.ArmHand, tmp_path: Path) -> None
     q = robot.home
     elbow = robot.links(q)["lwr_link_4"]
     clear: dict[str, float] = {}
-    for name, said in {
+    for name, expected_words in {
         "hull": "{kind: mesh, file: handle.obj",
         "parts": "{kind: mesh, file: handle.obj, parts: true",
         "files": f"{{kind: mesh, file: {names}",
         "object": f"{{kind: object, object: {tmp_path / 'handle.obj'}",
     }.items():
         path = tmp_path / "scene.yaml"
-        path.write_text(f"solids:\n  handle: {said}, xyz: {elbow[:3, 3].tolist()}}}\n")
+        path.write_text(f"solids:\n  handle: {expected_words}, xyz: {elbow[:3, 3].tolist()}}}\n")
         scene = ik.load_scene(path)
         assert len(scene.items["handle"].parts) == (1 if name == "hull" else 3)
         check = ik.Solver(robot, scene=scene).check(q, grasp)
@@ -120,8 +122,8 @@ def test_collisions_with_convex_parts(robot: ik.ArmHand, tmp_path: Path) -> None
     assert clear["hull"] < 0 < clear["parts"]
     assert clear["files"] == pytest.approx(clear["parts"])
     assert clear["object"] == pytest.approx(clear["parts"])
-    held = ik.Scene().holding(f"{tmp_path / 'handle.obj'}@0.1", elbow)
-    assert len(held.items[held.grasped or ""].parts) == 3
+    holding_scene = ik.Scene().holding(f"{tmp_path / 'handle.obj'}@0.1", elbow)
+    assert len(holding_scene.items[holding_scene.grasped or ""].parts) == 3
 
 
 def test_an_object_file_with_a_mesh(tmp_path: Path) -> None:
@@ -133,9 +135,9 @@ def test_an_object_file_with_a_mesh(tmp_path: Path) -> None:
     )
     path = tmp_path / "handle.yaml"
     path.write_text(text.replace("FILE", "[handle.obj]").replace("FACTOR", "0.1"))
-    held = grasps.load_object(path)
-    assert (held.name, held.mass) == ("handle", 0.1)
-    assert held.signed_distance([0.0, 0.0, 0.0]) == pytest.approx(0.05)
+    body = grasps.load_object(path)
+    assert (body.name, body.mass) == ("handle", 0.1)
+    assert body.signed_distance([0.0, 0.0, 0.0]) == pytest.approx(0.05)
     assert len(ik.Scene().holding(str(path), np.eye(4)).items[str(path)].parts) == 3
     for file, factor, says in (
         ("no.obj", "1", r"handle\.yaml: shape\.file: no such file"),
@@ -154,11 +156,11 @@ def test_an_object_file_with_a_mesh(tmp_path: Path) -> None:
 
 def test_a_flat_part_is_thin_and_a_flat_mesh_is_refused(tmp_path: Path) -> None:
     sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]])
-    several, alone = _written(tmp_path / "a.stl", [*_arch(), sheet]), tmp_path / "b.stl"
-    scene = ik.Scene({"a": {"kind": "mesh", "file": str(several), "parts": True}})
+    two_parts, sheet_file = _written(tmp_path / "a.stl", [*_arch(), sheet]), tmp_path / "b.stl"
+    scene = ik.Scene({"a": {"kind": "mesh", "file": str(two_parts), "parts": True}})
     extents = [np.ptp(solid.mesh()[0], axis=0).min() for solid, _ in scene.items["a"].parts]
     assert len(extents) == 4
     assert min(extents) == pytest.approx(1e-3, rel=1e-3)
-    _written(alone, [sheet])
+    _written(sheet_file, [sheet])
     with pytest.raises(ik.errors.DescriptionError, match=r"points are coplanar"):
-        ik.Scene({"a": {"kind": "mesh", "file": str(alone), "parts": True}})
+        ik.Scene({"a": {"kind": "mesh", "file": str(sheet_file), "parts": True}})

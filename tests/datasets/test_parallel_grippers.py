@@ -52,14 +52,14 @@ def write(layout: str, folder: Path, frames: np.ndarray, widths: np.ndarray) -> 
         np.savez(path, poses=bases, widths=widths)
         return path
     path = folder / "grasps.json"
-    held: dict[str, Any] = {"transforms": bases.tolist()}
+    data: dict[str, Any] = {"transforms": bases.tolist()}
     if layout == "acronym":
         success = [int(i != 2) for i in range(COUNT)]
-        held |= {"object": "mug.obj", "object_scale": 0.5}
-        held |= {"quality_flex_object_in_gripper": success}
+        data |= {"object": "mug.obj", "object_scale": 0.5}
+        data |= {"quality_flex_object_in_gripper": success}
     else:
-        held["widths"] = widths.tolist()
-    path.write_text(json.dumps(held))
+        data["widths"] = widths.tolist()
+    path.write_text(json.dumps(data))
     return path
 
 
@@ -79,8 +79,8 @@ def test_pads_are_where_the_grasp_has_them(name: str, layout: str, tmp_path: Pat
         for motor, position in grasp.posture.items():
             q[robot.actuators.index(motor)] = position
         points, _ = robot.contacts(q)
-        moved = np.asarray(grasp.palm) @ np.linalg.inv(robot.palm(q))
-        points = points @ moved[:3, :3].T + moved[:3, 3]
+        offset = np.asarray(grasp.palm) @ np.linalg.inv(robot.palm(q))
+        points = points @ offset[:3, :3].T + offset[:3, 3]
         frame = object_pose @ frames[row]
         assert points.mean(axis=0) == pytest.approx(frame[:3, 3], abs=2e-4)
         width = 0.08 if layout == "acronym" else widths[row]

@@ -18,13 +18,13 @@ from casadi_ik.integrations.datasets.unpickling import read_torch
 def test_a_file_that_torch_wrote() -> None:
     """By torch 2.13: strides, kinds of numbers, empty and single ones; grasps of two objects."""
     path = Path(__file__).parent / "written_by_torch.pt"
-    found = read_torch(path)
-    assert found["view"].array.tolist() == np.arange(12.0).reshape(3, 4).T[1:].tolist()
-    assert [kind.array.tolist() for kind in found["kinds"]] == [[0, 1, 2]] * 7
-    assert found["flag"].array.tolist() == [True, False]
-    assert found["scalar"].array == 2.5
-    assert found["empty"].array.shape == (0, 3)
-    assert found["info"] == {"num": 3}
+    content = read_torch(path)
+    assert content["view"].array.tolist() == np.arange(12.0).reshape(3, 4).T[1:].tolist()
+    assert [kind.array.tolist() for kind in content["kinds"]] == [[0, 1, 2]] * 7
+    assert content["flag"].array.tolist() == [True, False]
+    assert content["scalar"].array == 2.5
+    assert content["empty"].array.shape == (0, 3)
+    assert content["info"] == {"num": 3}
     robot = "panda+allegro_right"
     grasps = ik.load_candidates(path, robot, of="contactdb+apple")
     assert [grasp.palm is not None and len(grasp.posture) for grasp in grasps] == [16, 16]
@@ -64,13 +64,13 @@ def test_torch_files_of_other_kinds(tmp_path: Path) -> None:
     with pytest.raises(ik.errors.DescriptionError, match=r"set\.pt: file is not a zip file"):
         read_torch(path)
     write_torch(path, {"a": np.arange(4.0)})
-    size, more = (pickle.BININT + n.to_bytes(4, "little") + pickle.TUPLE for n in (4, 9))
+    size, nine_tuple = (pickle.BININT + n.to_bytes(4, "little") + pickle.TUPLE for n in (4, 9))
     with ZipFile(path) as archive:
         entries = {name: archive.read(name) for name in archive.namelist()}
     assert entries["set/data.pkl"].count(size) == 2  # of the raw file, then of the tensor
     head, shape = entries["set/data.pkl"].rsplit(size, 1)
     with ZipFile(path, "w") as archive:
-        for name, data in (entries | {"set/data.pkl": head + more + shape}).items():
+        for name, data in (entries | {"set/data.pkl": head + nine_tuple + shape}).items():
             archive.writestr(name, data)
     with pytest.raises(
         ik.errors.DescriptionError, match="a tensor that is larger than its storage"

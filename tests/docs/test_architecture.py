@@ -24,13 +24,13 @@ def test_a_solve_goes_through_eight_files_at_most() -> None:
 
 
 def test_an_addition_takes_the_files_that_are_named() -> None:
-    found = rows("Adding to it")
-    assert len(found) >= 9
-    for what, most, files, _ in found:
+    additions = rows("Adding to it")
+    assert len(additions) >= 9
+    for kind, max_files, files, _ in additions:
         named = files.split(" · ")
-        assert len(named) <= max(int(most), 1), what
+        assert len(named) <= max(int(max_files), 1), kind
         for file in re.findall(r"`([^`]+\.(?:py|c))`", files):
-            assert (ROOT / "casadi_ik" / file).is_file(), f"{what}: {file}"
+            assert (ROOT / "casadi_ik" / file).is_file(), f"{kind}: {file}"
 
 
 def test_every_folder_is_in_the_table_of_rooms() -> None:

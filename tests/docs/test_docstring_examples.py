@@ -14,7 +14,7 @@ import casadi_ik as ik
 from casadi_ik.solve import registry
 
 SUBMODULES = tuple(name for name in ik.__all__ if inspect.ismodule(getattr(ik, name)))
-WITHOUT = {
+WITHOUT_EXAMPLE = {
     "METHODS",  # a tuple of names
     *SUBMODULES,  # their names have their own
     "logs.Compression",  # three words
@@ -36,30 +36,31 @@ PLAIN = {
 
 
 def public_names() -> list[str]:
-    inside = (
+    submodules = (
         f"{module}.{name}"
         for module in SUBMODULES
         if module != "errors"
         for name in getattr(ik, module).__all__
     )
-    return [*ik.__all__, *inside]
+    return [*ik.__all__, *submodules]
 
 
-def found(name: str) -> Any:
-    thing: Any = ik
+def public_object(name: str) -> Any:
+    value: Any = ik
     for part in name.split("."):
-        module = inspect.ismodule(thing)
-        thing = getattr(thing, part) if module else inspect.getattr_static(thing, part)
-    return thing
+        module = inspect.ismodule(value)
+        value = getattr(value, part) if module else inspect.getattr_static(value, part)
+    return value
 
 
 def methods_of(name: str) -> list[str]:
     """Public methods of a class, inherited ones too."""
-    thing = found(name)
+    value = public_object(name)
     return [
-        f"{name}.{one}"
-        for one in dir(thing)
-        if not one.startswith("_") and inspect.isfunction(inspect.getattr_static(thing, one))
+        f"{name}.{attribute}"
+        for attribute in dir(value)
+        if not attribute.startswith("_")
+        and inspect.isfunction(inspect.getattr_static(value, attribute))
     ]
 
 
@@ -67,19 +68,21 @@ def documented() -> list[str]:
     return public_names() + [
         method
         for name in public_names()
-        if inspect.isclass(found(name)) and not issubclass(found(name), (str, int))
+        if inspect.isclass(public_object(name)) and not issubclass(public_object(name), (str, int))
         for method in methods_of(name)
     ]
 
 
 def text_of(name: str) -> str:
-    return inspect.getdoc(found(name)) or ""
+    return inspect.getdoc(public_object(name)) or ""
 
 
 def test_every_public_name_has_an_example() -> None:
-    names = [*public_names(), *(one for name in METHODS_TOO for one in methods_of(name))]
-    without = [name for name in names if name not in WITHOUT | PLAIN and ">>>" not in text_of(name)]
-    assert not without
+    names = [*public_names(), *(method for name in METHODS_TOO for method in methods_of(name))]
+    lacking = [
+        name for name in names if name not in WITHOUT_EXAMPLE | PLAIN and ">>>" not in text_of(name)
+    ]
+    assert not lacking
     assert all(">>>" not in text_of(name) for name in PLAIN), "has one after all"
 
 
@@ -93,8 +96,8 @@ def names(folder: Path) -> dict[str, Any]:
     """What the examples use without saying so; the page of the interface shows how it is made."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     solver = ik.Solver(robot)
-    away = np.eye(4)
-    away[0, 3] = -1.0
+    offset_pose = np.eye(4)
+    offset_pose[0, 3] = -1.0
     (folder / "hand.yaml").write_text("fingers: {thumb: 4, finger_2: 8, finger_3: 12}")
     return {
         "ik": ik,
@@ -104,7 +107,7 @@ def names(folder: Path) -> dict[str, Any]:
         "solver": solver,
         "grasp": grasp,
         "solution": solver.solve(grasp, log=folder / "cup.mcap"),
-        "far": solver.solve(grasp.at(away)),
+        "far": solver.solve(grasp.at(offset_pose)),
         "keypoints": 0.05 * np.random.default_rng(0).normal(size=(21, 3)),
     }
 

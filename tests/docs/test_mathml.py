@@ -17,9 +17,9 @@ def flat(tex: str) -> str:
 
 
 def test_an_index_stands_beside_a_letter_with_an_accent() -> None:
-    found = flat(r"\dot q_t")
-    assert "<msub><moveraccent" in found
-    assert "munderover" not in found
+    rendered = flat(r"\dot q_t")
+    assert "<msub><moveraccent" in rendered
+    assert "munderover" not in rendered
 
 
 def test_bars_of_a_norm_are_as_high_as_letters() -> None:

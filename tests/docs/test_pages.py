@@ -81,8 +81,8 @@ def fault(line: str) -> str:
             return f"no command {words[0]!r}"
         words.pop(0)
     options = () if name in GROUPS else load(name).options
-    known = {"--help", "--version", "--no-diagnose", *(option.name for option in options)}
-    unknown = [word for word in words if re.match(r"--[a-z]", word) and word not in known]
+    option_names = {"--help", "--version", "--no-diagnose", *(option.name for option in options)}
+    unknown = [word for word in words if re.match(r"--[a-z]", word) and word not in option_names]
     return f"no option {unknown[0]}" if unknown else ""
 
 
@@ -143,15 +143,15 @@ def test_commands_exist(page: Path) -> None:
 
 
 def test_files_are_accepted() -> None:
-    seen = []
+    examined = []
     for page in PAGES:
         for data in yaml_blocks(page.read_text()):
             if kind := kind_of(data):
                 errors = list(jsonschema.Draft7Validator(schema_of(kind)).iter_errors(data))
                 assert not errors, f"{page.name}: {errors[0].message}"
-                seen.append(kind)
-    assert len(seen) >= 7
-    assert set(seen) == {"grasp", "scene", "robot", "candidates"}
+                examined.append(kind)
+    assert len(examined) >= 7
+    assert set(examined) == {"grasp", "scene", "robot", "candidates"}
 
 
 def test_faults_are_seen() -> None:
@@ -170,11 +170,11 @@ def test_faults_are_seen() -> None:
 def test_python_runs_when_pasted(page: Path, folder: Path) -> None:
     """Every block alone, or after the page's first one."""
     save_files(page, folder)
-    first, *others = python_blocks(page)
-    known: dict[str, Any] = {}
-    outputs = {first: printed(first, known)}
-    for block in others:
-        outputs[block] = printed(block, dict(known))
+    first, *later_blocks = python_blocks(page)
+    namespace: dict[str, Any] = {}
+    outputs = {first: printed(first, namespace)}
+    for block in later_blocks:
+        outputs[block] = printed(block, dict(namespace))
     for block, text in WITH_OUTPUT.findall(page.read_text(encoding="utf-8")):
         assert outputs[block] == text
 
@@ -184,58 +184,61 @@ def grasps_shown() -> Iterator[tuple[str, dict[str, Any]]]:
     for page in PAGES:
         for data in yaml_blocks(page.read_text()):
             kind = kind_of(data)
-            for one in data["candidates"] if kind == "candidates" else [data] * (kind == "grasp"):
-                yield page.name, {"robot": data["robot"]} | one
+            for item in data["candidates"] if kind == "candidates" else [data] * (kind == "grasp"):
+                yield page.name, {"robot": data["robot"]} | item
     for source in sorted((ROOT / "casadi_ik").rglob("*.py")):
-        for found in GRASP.finditer(source.read_text(encoding="utf-8")):
-            if "..." not in found[0]:
-                yield source.name, {"robot": "kuka_lwr_barrett"} | yaml.safe_load(found[0])
+        for match in GRASP.finditer(source.read_text(encoding="utf-8")):
+            if "..." not in match[0]:
+                yield source.name, {"robot": "kuka_lwr_barrett"} | yaml.safe_load(match[0])
 
 
 @pytest.mark.slow
 def test_every_grasp_shown_is_solved(tmp_path: Path) -> None:
-    shown = list(grasps_shown())
-    assert len(shown) >= 5
-    for where, data in shown:
+    grasps_on_pages = list(grasps_shown())
+    assert len(grasps_on_pages) >= 5
+    for source, data in grasps_on_pages:
         path = tmp_path / "shown.yaml"
         path.write_text(yaml.safe_dump(data), encoding="utf-8")
         grasp = ik.load_grasp(path)
         solution = ik.Solver(ik.load_robot(grasp.robot)).solve(grasp)
-        assert solution.success, f"{where}: {solution.status.name}"
+        assert solution.success, f"{source}: {solution.status.name}"
 
 
 def without_pictures(words: list[str]) -> list[str]:
     """Arguments without what is drawn: tests/views draws."""
-    kept = list(words)
+    words_left = list(words)
     for name in ("--picture", "--picture-dark", "--animation"):
-        if name in kept:
-            del kept[kept.index(name) : kept.index(name) + 2]
-    return kept
+        if name in words_left:
+            del words_left[words_left.index(name) : words_left.index(name) + 2]
+    return words_left
 
 
 def missing(words: list[str]) -> bool:
     """Whether a command reads what a reader has to bring along."""
-    given = [
+    values_of_options = [
         word
-        for before, word in pairwise(["", *words])
-        if not before.startswith("--out") and before != "--log"
+        for previous, word in pairwise(["", *words])
+        if not previous.startswith("--out") and previous != "--log"
     ]
-    return any(word.isupper() or (INPUT.search(word) and not Path(word).exists()) for word in given)
+    return any(
+        word.isupper() or (INPUT.search(word) and not Path(word).exists())
+        for word in values_of_options
+    )
 
 
 def gone_through(page: Path, folder: Path) -> list[str]:
     """A page done from top to bottom; the commands that were run."""
     save_files(page, folder)
     text, names, done = page.read_text(encoding="utf-8"), {}, []
-    for found in STEP.finditer(text):
-        if found["python"]:
-            printed(found["python"], names)
-        for line in commands(found[0]):
+    for match in STEP.finditer(text):
+        if match["python"]:
+            printed(match["python"], names)
+        for line in commands(match[0]):
             words = without_pictures(shlex.split(line, comments=True)[1:])
             if words[0] in NOT_RUN or missing(words) or words == ["import", "my_robot.yaml"]:
                 continue
             unsolved = re.match(
-                r"\n*```text\n(UNREACHABLE|NOT_FOUND|COLLISION)", text[found.end() :]
+                r"\n*```text\n(UNREACHABLE|NOT_FOUND|COLLISION)", text[match.end() :]
             )
             assert main(words) == (1 if unsolved else 0), line
             done.append(line)
@@ -256,7 +259,7 @@ def gone_through(page: Path, folder: Path) -> list[str]:
 )
 def test_pages_are_gone_through(page: str, count: int, folder: Path) -> None:
     """Commands, Python and files in the order of the page, as one reader does it."""
-    path = next(one for one in PAGES if one.stem == page)
+    path = next(candidate for candidate in PAGES if candidate.stem == page)
     assert len(gone_through(path, folder)) >= count
 
 
@@ -309,15 +312,15 @@ def test_pages_install_no_unpublished_package() -> None:
 
 
 def test_every_public_name_is_on_a_page_of_the_reference() -> None:
-    shown = []
+    listed = []
     for page in (ROOT / "docs" / "reference").glob("*.md"):
         for names in re.findall(
             r"^<!-- here: api(?:-pages)? (.*) -->$", page.read_text(), re.MULTILINE
         ):
-            shown += names.split()
+            listed += names.split()
     submodules = {name for name in ik.__all__ if isinstance(getattr(ik, name), ModuleType)}
     names = set(ik.__all__) - submodules
     for module in submodules - {"errors"}:
         names |= {f"{module}.{name}" for name in getattr(ik, module).__all__}
     names -= {"CasadiIKError"}  # with the other errors, by their module
-    assert sorted(name for name in shown if not name.startswith("errors.")) == sorted(names)
+    assert sorted(name for name in listed if not name.startswith("errors.")) == sorted(names)

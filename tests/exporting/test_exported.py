@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import main
-from processes import said
+from processes import output_of
 
 import casadi_ik as ik
 from casadi_ik.compile.codegen import driver_text
@@ -50,7 +50,7 @@ def plain_project(tmp_path_factory) -> Path:
 
 
 def compiled(project: Path, *flags: str) -> None:
-    said("gcc", *STRICT, *flags, "-Iinclude", "-Isrc", "-Itest", cwd=project)
+    output_of("gcc", *STRICT, *flags, "-Iinclude", "-Isrc", "-Itest", cwd=project)
 
 
 @pytest.mark.slow
@@ -65,11 +65,11 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     objects = [Path(name).with_suffix(".o").name for name in sources]
     for program, text in (("stored", "test/test.c"), ("shown", "example/main.c")):
         compiled(project, *SANITIZERS, text, *objects, "-o", program, "-lm")
-    assert "1000 targets, 402 solved" in said(project / "stored")
-    assert "solved after" in said(project / "shown")
-    listed = said("nm", "-u", "-P", *objects, cwd=project).splitlines()
-    wanted = {line.split()[0] for line in listed if line.endswith(" U") or " U " in line}
-    foreign = {name for name in wanted if not name.startswith(("arm_", "__asan", "__ubsan"))}
+    assert "1000 targets, 402 solved" in output_of(project / "stored")
+    assert "solved after" in output_of(project / "shown")
+    listed = output_of("nm", "-u", "-P", *objects, cwd=project).splitlines()
+    undefined = {line.split()[0] for line in listed if line.endswith(" U") or " U " in line}
+    foreign = {name for name in undefined if not name.startswith(("arm_", "__asan", "__ubsan"))}
     assert "sin" in foreign
     assert foreign <= LIBM | COMPILERS
 
@@ -118,33 +118,35 @@ def test_a_body_keeps_clear_of_a_scene_and_of_itself(tmp_path, name):
     objects = [Path(name).with_suffix(".o").name for name in sources]
     for program, text in (("stored", "test/test.c"), ("answers", "scene.c")):
         compiled(tmp_path, text, *objects, "-o", program, "-lm")
-    assert "wrong: 0" in said(tmp_path / "stored")
+    assert "wrong: 0" in output_of(tmp_path / "stored")
 
     place = [0.5, 0.2, 0.6]
     scene = ik.Scene({"box": {"kind": "box", "size": [0.3, 0.3, 0.2], "xyz": place}})
-    solver, drawn = ik.Solver(robot, scene=scene), robot.random(np.random.default_rng(2), 3000)
+    solver, samples = ik.Solver(robot, scene=scene), robot.random(np.random.default_rng(2), 3000)
     any_grasp = ik.Grasp({robot.fingers[0]: ik.Contact([0.5, 0.0, 0.5])})
 
     def clear(q):
-        found = solver.check(q, any_grasp)
-        assert found is not None
-        return found
+        verdicts = solver.check(q, any_grasp)
+        assert verdicts is not None
+        return verdicts
 
-    q = drawn[clear(drawn).free][:60]
+    q = samples[clear(samples).free][:60]
     (points, normals), count = robot.contacts(q), len(q)
     points[::3, 0] = normals[::3, 0] = np.nan
-    near = np.arange(count) % 4 == 1
-    rows = np.hstack([near[:, None], *(a.reshape(count, -1) for a in (points, normals, q + 0.01))])
-    asked = np.array([*np.eye(3).ravel(), *place]).tobytes() + rows.tobytes()
-    lines = [line.split() for line in said(tmp_path / "answers", input=asked).splitlines()]
-    found = np.array([[float.fromhex(word) for word in words[1:]] for words in lines])
+    is_near = np.arange(count) % 4 == 1
+    rows = np.hstack(
+        [is_near[:, None], *(a.reshape(count, -1) for a in (points, normals, q + 0.01))]
+    )
+    payload = np.array([*np.eye(3).ravel(), *place]).tobytes() + rows.tobytes()
+    lines = [line.split() for line in output_of(tmp_path / "answers", input=payload).splitlines()]
+    distances = np.array([[float.fromhex(word) for word in words[1:]] for words in lines])
     assert {words[0] for words in lines} == {str(int(ik.Status.SOLVED))}
-    answers, clearance = found[:, 1:], clear(found[:, 1:])
+    answers, clearance = distances[:, 1:], clear(distances[:, 1:])
     assert clearance.free.all()
-    assert np.allclose(clearance.distance, found[:, 0], atol=1e-9)
-    away = np.linalg.norm(robot.contacts(answers)[0] - points, axis=2)
-    assert np.nanmax(away) < 5.001e-3
-    assert np.isnan(away).sum() == len(points[::3])
+    assert np.allclose(clearance.distance, distances[:, 0], atol=1e-9)
+    offsets = np.linalg.norm(robot.contacts(answers)[0] - points, axis=2)
+    assert np.nanmax(offsets) < 5.001e-3
+    assert np.isnan(offsets).sum() == len(points[::3])
     # Or nothing was looked for.
     first = ik.Solver(robot).solve_batch(points, normals).q
     assert (~clear(first).free).sum() > 10
@@ -159,7 +161,7 @@ def test_a_body_s_sides_and_trunk_go_with_it(tmp_path):
     assert (tmp_path / "src" / "g1_side_1.c").is_file()
     sources = [str(path.relative_to(tmp_path)) for path in sorted(tmp_path.glob("src/*.c"))]
     compiled(tmp_path, "-O0", *sources, "test/test.c", "-o", "stored", "-lm")
-    assert "wrong: 0" in said(tmp_path / "stored")
+    assert "wrong: 0" in output_of(tmp_path / "stored")
 
 
 WINE = shutil.which("wine64") or shutil.which("wine64", path="/usr/lib/wine")
@@ -184,12 +186,12 @@ def test_stored_targets_bit_for_bit_on_other_machines(
     folders = [f"-I{plain_project / name}" for name in ("include", "src", "test")]
     command = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-std=c11", "-O1"]
     command += ["-ffp-contract=off", "-fno-sanitize=all", *folders, *map(str, sources)]
-    made = tmp_path / program
-    said(*command, "-o", made, "-lm")
-    own = {"WINEPREFIX": str(tmp_path / "wine"), "WINEDEBUG": "-all"}
-    found = said(runner, made, env=os.environ | own)
-    assert "1000 targets" in found
-    assert "wrong: 0" in found
+    executable = tmp_path / program
+    output_of(*command, "-o", executable, "-lm")
+    wine_options = {"WINEPREFIX": str(tmp_path / "wine"), "WINEDEBUG": "-all"}
+    output = output_of(runner, executable, env=os.environ | wine_options)
+    assert "1000 targets" in output
+    assert "wrong: 0" in output
 
 
 @pytest.mark.slow
@@ -197,15 +199,15 @@ def test_in_a_scene_arms_swing_out_of_the_way(robot):
     """Or the comparison of stored answers would say nothing of the choice among arms."""
     solver = ik.Solver(robot)
     targets = SceneTargets(solver, 8)
-    before = stored(solver)[:200]
-    after = [targets.answered(target) for target in before]
-    moved = [b["q"] != a["q"] for b, a in zip(before, after, strict=True)]
-    assert sum(moved) > 20
+    q_before = stored(solver)[:200]
+    after = [targets.answered(target) for target in q_before]
+    differs = [b["q"] != a["q"] for b, a in zip(q_before, after, strict=True)]
+    assert sum(differs) > 20
     ends = {ik.Status(target["status"]).name for target in after}
     assert {"SOLVED", "COLLISION"} <= ends
 
 
-ASKED = """
+QUERY_PROGRAM = """
 #include <stdio.h>
 #include "arm.h"
 static arm_solver solver;
@@ -235,10 +237,12 @@ def malformed(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, ...]:
         for _ in range(rng.integers(3)):
             array = (points, normals, q0[:, None])[rng.integers(3)]
             vector = array[row, rng.integers(array.shape[1])]
-            odd, whole = rng.choice(ODD), rng.random() < 0.8
+            odd, is_whole_vector = rng.choice(ODD), rng.random() < 0.8
             # Most others are out of reach, which takes long.
-            some = slice(None) if whole or np.isfinite(odd) else rng.integers(len(vector))
-            vector[some] = odd * (vector[some] if array is normals or rng.random() < 0.2 else 1.0)
+            index = (
+                slice(None) if is_whole_vector or np.isfinite(odd) else rng.integers(len(vector))
+            )
+            vector[index] = odd * (vector[index] if array is normals or rng.random() < 0.2 else 1.0)
     return points, normals, q0, rng.random(count) < 0.5
 
 
@@ -247,23 +251,23 @@ def malformed(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, ...]:
 def test_malformed_targets_end_as_in_python(plain_project):
     """What Python refuses is bad input in C; all else ends alike, in the same configuration."""
     robot, count = ik.load_robot("ar10"), 1500
-    (plain_project / "asked.c").write_text(ASKED)
+    (plain_project / "asked.c").write_text(QUERY_PROGRAM)
     sources = [str(path.relative_to(plain_project)) for path in plain_project.glob("src/*.c")]
     compiled(plain_project, "-O1", "asked.c", *sources, "-o", "asked", "-lm")
-    points, normals, q0, near = malformed(robot, count)
-    rows = np.hstack([near[:, None], *(a.reshape(count, -1) for a in (points, normals, q0))])
-    lines = said(plain_project / "asked", input=rows.tobytes()).splitlines()
-    found = [line.split() for line in lines]
+    points, normals, q0, has_q0 = malformed(robot, count)
+    rows = np.hstack([has_q0[:, None], *(a.reshape(count, -1) for a in (points, normals, q0))])
+    lines = output_of(plain_project / "asked", input=rows.tobytes()).splitlines()
+    outputs = [line.split() for line in lines]
     fast, refused, ends = ik.Solver(robot).fast(), 0, set()
     for row in range(count):
-        status, *words = found[row]
-        asked = points[row], normals[row], q0[row] if near[row] else None
+        status, *words = outputs[row]
+        target = points[row], normals[row], q0[row] if has_q0[row] else None
         if status == "-2":
             with pytest.raises(ik.errors.InputError):
-                fast(*asked)
+                fast(*target)
             refused += 1
             continue
-        q, ended = fast(*asked)
+        q, ended = fast(*target)
         assert int(status) == ended, row
         np.testing.assert_array_equal(q, [float.fromhex(word) for word in words], f"row {row}")
         ends.add(ended.name)
@@ -305,23 +309,23 @@ def test_other_hands_are_looked_at_as_in_python(tmp_path):
     (out / "grasped.c").write_text(GRASPED)
     sources = [str(path.relative_to(out)) for path in out.glob("src/*.c")]
     compiled(out, "-O0", "grasped.c", *sources, "-o", "grasped", "-lm")
-    grasps, asked = page["grasp_entries"](robot, "panda+shadow"), b""
-    for one in grasps:
-        solids = [[s["kind"], *s["size"], *s["pose"]] for s in one["solids"]]
+    grasps, payload = page["grasp_entries"](robot, "panda+shadow"), b""
+    for shown_grasp in grasps:
+        solids = [[s["kind"], *s["size"], *s["pose"]] for s in shown_grasp["solids"]]
         free = [np.nan] * 3
-        vectors = [v or free for name in ("points", "normals") for v in one[name]]
+        vectors = [v or free for name in ("points", "normals") for v in shown_grasp[name]]
         numbers = [[len(solids)], *solids, *vectors]
-        asked += b"".join(np.array(part, dtype=float).tobytes() for part in numbers)
-    lines = said(out / "grasped", input=asked).splitlines()
+        payload += b"".join(np.array(part, dtype=float).tobytes() for part in numbers)
+    lines = output_of(out / "grasped", input=payload).splitlines()
     solver = ik.Solver(robot, scene=ik.Scene({}))
-    for one, line in zip(grasps, lines, strict=True):
+    for shown_grasp, line in zip(grasps, lines, strict=True):
         status, *words = line.split()
-        grasp = ik.load_grasp(one["name"])
-        asked_for = zip(robot.fingers, one["points"], one["normals"], strict=True)
+        grasp = ik.load_grasp(shown_grasp["name"])
+        asked_for = zip(robot.fingers, shown_grasp["points"], shown_grasp["normals"], strict=True)
         contacts = {name: ik.Contact(*pair) for name, *pair in asked_for if pair[0] is not None}
-        same = ik.Grasp(contacts, object=grasp.object, object_pose=grasp.object_pose)
-        answer = solver.solve(same, diagnose=False)
-        assert int(status) == answer.status == ik.Status.SOLVED, one["name"]
+        same_grasp = ik.Grasp(contacts, object=grasp.object, object_pose=grasp.object_pose)
+        answer = solver.solve(same_grasp, diagnose=False)
+        assert int(status) == answer.status == ik.Status.SOLVED, shown_grasp["name"]
         np.testing.assert_array_equal([float.fromhex(word) for word in words], answer.q)
 
 
@@ -329,7 +333,7 @@ def test_other_hands_are_looked_at_as_in_python(tmp_path):
 def test_no_state_outside_the_struct(plain_project):
     project = plain_project
     compiled(project, "-O1", "-c", "src/arm_look_up.c", "src/arm_solver.c", "src/arm_judge.c")
-    listed = said("nm", "-P", "arm_look_up.o", "arm_solver.o", "arm_judge.o", cwd=project)
+    listed = output_of("nm", "-P", "arm_look_up.o", "arm_solver.o", "arm_judge.o", cwd=project)
     kinds = {line.split()[1]: line.split()[0] for line in listed.splitlines() if " " in line}
     assert "T" in kinds
     assert not set(kinds) & set("bBCsSgG"), kinds
@@ -345,7 +349,7 @@ def test_wrapper_in_cpp(project, tmp_path):
         "  return solver.solve(p, n, &q0) == arm::Status::solved ? 0 : 1;\n}\n"
     )
     flags = ["-std=c++17", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-fsyntax-only"]
-    said("g++", *flags, f"-I{project / 'include'}", text)
+    output_of("g++", *flags, f"-I{project / 'include'}", text)
 
 
 @pytest.mark.parametrize(
@@ -402,9 +406,9 @@ def test_names_from_files_end_no_comment():
 
 def test_kernels_compiled_ahead_with_progress(capsys):
     assert main(["compile", "kuka_lwr_barrett"]) == 0
-    told = capsys.readouterr()
-    assert told.out.startswith("COMPILED")
-    lines = [line for line in told.err.splitlines() if "kuka_lwr_barrett" in line]
+    captured = capsys.readouterr()
+    assert captured.out.startswith("COMPILED")
+    lines = [line for line in captured.err.splitlines() if "kuka_lwr_barrett" in line]
     numbers = [re.findall(r"\b(\d+)/(\d+)\b", line)[-1] for line in lines]
     assert len(numbers) > 1
     assert numbers == [(str(i), str(len(numbers))) for i in range(1, len(numbers) + 1)]
@@ -466,18 +470,18 @@ def test_limits_are_moved_inwards(robot):
     lower, upper = SinglePrecision(robot).bounds
     for bounds in (lower, upper):
         assert np.array_equal(bounds, bounds.astype(np.float32))
-    inside = np.minimum(lower - robot.lower, robot.upper - upper)
-    assert (inside > 0.5 * ROUNDING).all()
-    assert (inside < 5 * ROUNDING).all()
+    insets = np.minimum(lower - robot.lower, robot.upper - upper)
+    assert (insets > 0.5 * ROUNDING).all()
+    assert (insets < 5 * ROUNDING).all()
 
 
 @needs_gcc
 def test_sines_and_arcs_to_their_last_places(tmp_path):
     (tmp_path / "places.c").write_text(driver_text("elementary_single") + LAST_PLACES)
-    said(
+    output_of(
         "gcc", *WARNED, "-O1", "-ffp-contract=off", "places.c", "-o", "places", "-lm", cwd=tmp_path
     )
-    lines = said(tmp_path / "places").splitlines()
+    lines = output_of(tmp_path / "places").splitlines()
     worst, special = (list(map(float, line.split())) for line in lines)
     assert max(worst[:2]) < 2
     assert max(worst[2:]) < 4
@@ -504,23 +508,23 @@ def test_nothing_is_double(single_project):
 @needs_gcc
 def test_what_it_solves_is_solved_in_double_precision(single_project):
     """By its own test, under sanitizers; the long generated file without, which takes as long."""
-    rest = [
+    other_lines = [
         f"src/{path.name}" for path in single_project.glob("src/*.c") if "_solve.c" not in path.name
     ]
     places = ("-Iinclude", "-Isrc", "-Itest", "-ffp-contract=off")
-    said("gcc", *WARNED, *places, "-O0", "-c", "src/arm_solve.c", cwd=single_project)
+    output_of("gcc", *WARNED, *places, "-O0", "-c", "src/arm_solve.c", cwd=single_project)
     tests = ("test/test.c", "test/judge.c")
-    command = (*WARNED, *SANITIZERS, *places, "-O0", *tests, *rest, "arm_solve.o")
-    said("gcc", *command, "-lm", "-o", "stored", cwd=single_project)
-    found = said(single_project / "stored")
-    solved, wanted = re.findall(r"(\d+) solved of (\d+) that", found)[0]
-    assert int(wanted) == 402
-    assert int(solved) >= int(wanted)
-    assert ", 0 missed, " in found
-    assert "wrong: 0" in found
+    command = (*WARNED, *SANITIZERS, *places, "-O0", *tests, *other_lines, "arm_solve.o")
+    output_of("gcc", *command, "-lm", "-o", "stored", cwd=single_project)
+    output = output_of(single_project / "stored")
+    solved, expected_count = re.findall(r"(\d+) solved of (\d+) that", output)[0]
+    assert int(expected_count) == 402
+    assert int(solved) >= int(expected_count)
+    assert ", 0 missed, " in output
+    assert "wrong: 0" in output
 
     for program in ("example/main.c", "bench/bench.c"):
-        said("gcc", *WARNED, "-Iinclude", "-fsyntax-only", program, cwd=single_project)
+        output_of("gcc", *WARNED, "-Iinclude", "-fsyntax-only", program, cwd=single_project)
 
 
 def test_webassembly_has_doubles(tmp_path, capsys):

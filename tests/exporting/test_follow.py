@@ -12,7 +12,7 @@ import pytest
 from commands import main
 from excursions import excursion
 from moved_base import on_pedestal
-from processes import said
+from processes import output_of
 
 import casadi_ik as ik
 
@@ -24,7 +24,7 @@ PERIOD = 0.004
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 
-FOLLOWED = """
+FOLLOW_PROGRAM = """
 #include <stdio.h>
 #include "arm.h"
 static arm_follower follower;
@@ -70,14 +70,14 @@ def built(out: Path, name: str, text: str, sources: str, *flags: str) -> Path:
     (out / f"{name}.c").write_text(text.replace("PERIOD", repr(PERIOD)))
     files = [str(path.relative_to(out)) for path in out.glob(f"src/{sources}.c")]
     command = ["gcc", *STRICT, *flags, "-Iinclude", f"{name}.c", *files, "-o", name, "-lm"]
-    said(*command, cwd=out)
+    output_of(*command, cwd=out)
     return out / name
 
 
-def asked(program: Path, *arrays: np.ndarray) -> tuple[list[int], np.ndarray]:
+def run_program(program: Path, *arrays: np.ndarray) -> tuple[list[int], np.ndarray]:
     """What it says: a status and a configuration a line."""
     data = b"".join(np.ascontiguousarray(array, dtype=float).tobytes() for array in arrays)
-    lines = [line.split() for line in said(program, input=data).splitlines()]
+    lines = [line.split() for line in output_of(program, input=data).splitlines()]
     return [int(line[0]) for line in lines], np.array(
         [[float.fromhex(word) for word in line[1:]] for line in lines]
     )
@@ -113,19 +113,19 @@ def stream(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, np.ndarray, np.nd
 
 @needs_gcc
 def test_follows_as_in_python_and_within_limits(robot, project):
-    program = built(project, "followed", FOLLOWED, "arm_follow", "-O1", *SANITIZERS)
+    program = built(project, "followed", FOLLOW_PROGRAM, "arm_follow", "-O1", *SANITIZERS)
     points, normals, palms = stream(robot, 1000)
     rows = np.hstack([points.reshape(len(points), -1), normals.reshape(len(points), -1), palms])
-    status, q = asked(program, robot.home, rows)
+    status, q = run_program(program, robot.home, rows)
 
     follower = ik.Solver(robot).follow(q0=robot.home, period=PERIOD)
     names = ("HOLDING", "FOLLOWING", "LATE", "MISSED")
-    for row, (ended, found) in enumerate(zip(status, q, strict=True)):
+    for row, (ended, q_row) in enumerate(zip(status, q, strict=True)):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = palms[row, 1:10].reshape(3, 3), palms[row, 10:]
         expected = follower(points[row], normals[row], pose if palms[row, 0] else None)
         assert names[ended] == follower.state.status.name, row
-        np.testing.assert_array_equal(found, expected, f"row {row}")
+        np.testing.assert_array_equal(q_row, expected, f"row {row}")
     assert set(status) == {0, 1, 2, 3}
 
     steps = np.diff(np.vstack([robot.home, robot.home, q]), axis=0)
@@ -139,7 +139,7 @@ def test_follows_as_in_python_and_within_limits(robot, project):
 @needs_gcc
 def test_what_moves_within_reach_is_followed_closely(robot, project):
     """The motors stand still in the last second of four in which the target does."""
-    program = built(project, "closely", FOLLOWED, "arm_follow", "-O1")
+    program = built(project, "closely", FOLLOW_PROGRAM, "arm_follow", "-O1")
     second = round(1 / PERIOD)
     turn = np.append(np.linspace(0, 4, 500), np.full(4 * second, 4.0))[:, None, None]
     points, normals = robot.contacts(robot.home)
@@ -147,7 +147,7 @@ def test_what_moves_within_reach_is_followed_closely(robot, project):
     none = np.zeros((len(points), 13))
     facing = np.broadcast_to(normals.ravel(), (len(points), normals.size))
     rows = np.hstack([points.reshape(len(points), -1), facing, none])
-    status, q = asked(program, robot.home, rows)
+    status, q = run_program(program, robot.home, rows)
     assert set(status) == {1}
     np.testing.assert_array_equal(q[-second:], q[-1:].repeat(second, axis=0))
     assert np.linalg.norm(robot.contacts(q)[0] - points, axis=2).max() < 2e-3
@@ -155,13 +155,13 @@ def test_what_moves_within_reach_is_followed_closely(robot, project):
 
 @needs_gcc
 def test_the_way_back_is_as_in_python(robot, project):
-    program = built(project, "back", FOLLOWED, "arm_follow", "-O1", *SANITIZERS)
+    program = built(project, "back", FOLLOW_PROGRAM, "arm_follow", "-O1", *SANITIZERS)
     rng = np.random.default_rng(7)
     postures = np.concatenate([robot.random(rng, 1) for _ in range(4)])
     start = robot.home + 0.5 * (postures[-1] - robot.home)
     targets = list(excursion(robot, start, "out", PERIOD))
     rows = np.array([[*points.ravel(), *normals.ravel()] for points, normals in targets])
-    status, q = asked(program, start, np.hstack([rows, np.zeros((len(rows), 13))]))
+    status, q = run_program(program, start, np.hstack([rows, np.zeros((len(rows), 13))]))
     follower = ik.Solver(robot).follow(start, PERIOD)
     expected = np.array([follower(*target) for target in targets])
     np.testing.assert_array_equal(q, expected)
@@ -177,15 +177,17 @@ def test_palms_as_in_python(robot, project):
     poses[50:55, :3, 3] += 5.0
     palms = np.hstack([poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]])
     wrong = palms[:1] * 2, np.where(np.arange(12) == 11, np.nan, palms[:1])
-    status, found = asked(program, *np.hstack([palms, q]), *(np.append(w, q[0]) for w in wrong))
+    status, statuses = run_program(
+        program, *np.hstack([palms, q]), *(np.append(w, q[0]) for w in wrong)
+    )
     assert status[60:] == [-2, -2]
     hand = robot.description.hand_actuators
     hands = {robot.actuators[i]: q[:, i] for i in hand}
     batch = ik.Solver(robot).solve_palms(poses, hands)
     assert status[:60] == batch.status.tolist()
-    np.testing.assert_allclose(found[:60], batch.q, atol=1e-9)
-    assert np.abs(robot.palm(found[:50])[:, :3, 3] - poses[:50, :3, 3]).max() < 5e-3
-    np.testing.assert_array_equal(found[:50][:, list(hand)], q[:50][:, list(hand)])
+    np.testing.assert_allclose(statuses[:60], batch.q, atol=1e-9)
+    assert np.abs(robot.palm(statuses[:50])[:, :3, 3] - poses[:50, :3, 3]).max() < 5e-3
+    np.testing.assert_array_equal(statuses[:50][:, list(hand)], q[:50][:, list(hand)])
 
 
 def test_in_single_precision_nothing_follows(tmp_path, capsys):
@@ -195,7 +197,7 @@ def test_in_single_precision_nothing_follows(tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-USED = """
+USE_PROGRAM = """
 import { FollowStatus, Solver, home, motors, upper } from "./arm.js";
 const solver = await Solver.load(), rows = [];
 solver.followFrom(home, { period: 0.004 });
@@ -222,12 +224,12 @@ def test_in_javascript_too(tmp_path):
     out = tmp_path / "module"
     words = ["export", "ar10", "--prefix", "arm", "--target", "wasm", "--follow"]
     assert main([*words, "--out", str(out)]) == 0
-    (out / "use.mjs").write_text(USED)
-    found = json.loads(said("node", "use.mjs", cwd=out))
-    assert (found["ended"], found["refused"], found["length"]) == (True, True, True)
+    (out / "use.mjs").write_text(USE_PROGRAM)
+    answers = json.loads(output_of("node", "use.mjs", cwd=out))
+    assert (answers["ended"], answers["refused"], answers["length"]) == (True, True, True)
     robot = ik.load_robot("ar10")
     follower = ik.Solver(robot).follow(q0=robot.home, period=0.004)
-    for i, row in enumerate(found["rows"]):
+    for i, row in enumerate(answers["rows"]):
         targets = robot.contacts(robot.home + 5e-4 * i * (robot.upper - robot.home))
         np.testing.assert_allclose(row, follower(*targets), atol=1e-9)
 
@@ -264,14 +266,14 @@ def test_a_joint_without_limits_has_no_border(tmp_path):
     points, normals = source.contacts(q)
     targets = np.concatenate([points.reshape(count, -1), normals.reshape(count, -1)], axis=1)
     program = built(out, "solved", SOLVED, "arm_*")
-    statuses, answers = asked(program, np.concatenate([q - 0.1, targets], axis=1)[::100])
+    statuses, answers = run_program(program, np.concatenate([q - 0.1, targets], axis=1)[::100])
     assert set(statuses) == {1}
     assert np.abs(answers[:, 0] - q[::100, 0]).max() < 1.0
-    program = built(out, "followed", FOLLOWED, "arm_follow", "-O1")
+    program = built(out, "followed", FOLLOW_PROGRAM, "arm_follow", "-O1")
     palms = np.zeros((count, 13))
-    statuses, answers = asked(program, q[0], np.concatenate([targets, palms], axis=1))
+    statuses, answers = run_program(program, q[0], np.concatenate([targets, palms], axis=1))
     assert set(statuses) == {1}
     assert np.abs(answers[:, 0] - q[:, 0]).max() < 0.5
     follower = ik.Solver(source).follow(q0=q[0], period=PERIOD)
-    followed = [follower(*target) for target in zip(points, normals, strict=True)]
-    np.testing.assert_allclose(followed, answers, atol=1e-6)
+    states = [follower(*target) for target in zip(points, normals, strict=True)]
+    np.testing.assert_allclose(states, answers, atol=1e-6)

@@ -25,7 +25,7 @@ ROBOT, BODY = "kuka_lwr_barrett", "two_ur10e+barrett_bh8_280"
 ANSWERED = "globalThis.casadiIk?.now.answer && casadiIk.now.shown === casadiIk.now.answer.q"
 
 
-def build(out: Path, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def build(out: Path, module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The page of two robots, and their exported modules.
 
     Compiled without optimisation, in a third of the time: that both give the same bits is what the
@@ -37,7 +37,7 @@ def build(out: Path, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plainly = tuple("-O0" if word == "-O2" else word for word in project.COMMAND)
     # Without optimisation zig guards the stack by a function that a browser does not have.
     monkeypatch.setattr(project, "COMMAND", (*plainly, "-fno-stack-protector"))
-    words = ["build", "--robots", ROBOT, BODY, "--out", str(out), "--keep", str(kept)]
+    words = ["build", "--robots", ROBOT, BODY, "--out", str(out), "--keep", str(module)]
     monkeypatch.setattr(sys, "argv", words)
     try:
         runpy.run_path(str(BUILD), run_name="__main__")
@@ -56,11 +56,11 @@ def opened(browser: Browser, url: str, width: int, height: int, phone: bool = Fa
     return page
 
 
-def now(page: Page, name: str) -> object:
+def current(page: Page, name: str) -> object:
     return page.evaluate(f"casadiIk.now.{name}")
 
 
-def asked(page: Page) -> np.ndarray:
+def joint_positions(page: Page) -> np.ndarray:
     return np.array(page.evaluate("casadiIk.now.points.map((p) => p.toArray())"))
 
 
@@ -71,77 +71,77 @@ def settled(page: Page) -> None:
 
 def the_page_follows(page: Page, robot: ik.ArmHand) -> None:
     """A contact is dragged: the fingertip that is drawn is there, by Python's kinematics."""
-    before = asked(page)
+    q_before = joint_positions(page)
     x, y = page.evaluate("casadiIk.pixel('point 0')")
     page.drag((x, y), (x + 9, y - 9), steps=4)
     settled(page)
-    after = asked(page)
-    assert 2e-3 < np.linalg.norm(after[0] - before[0]) < 0.1
-    assert now(page, "answer.status") == ik.Status.SOLVED
+    after = joint_positions(page)
+    assert 2e-3 < np.linalg.norm(after[0] - q_before[0]) < 0.1
+    assert current(page, "answer.status") == ik.Status.SOLVED
     q = np.array(page.evaluate("[...casadiIk.now.shown]"))
     points, _ = robot.contacts(q)
     assert np.linalg.norm(points - after, axis=1).max() <= 5.001e-3
     # What is drawn are the shapes that distances are measured between, where Python has them.
-    drawn = page.evaluate(
+    drawn_poses = page.evaluate(
         "casadiIk.now.body.parts.map(({ kind, at, mesh }) => [kind, at, mesh.position.toArray()])"
     )
     (placed,) = ClearanceKernel(robot.description).shape_poses(q[None])
-    told = page.evaluate("[...casadiIk.now.solving.solver.shapes(casadiIk.now.shown)]")
-    assert np.abs(np.array(told) - placed.ravel()).max() < 1e-12
-    assert len(drawn) > 20
-    assert {kind for kind, _, _ in drawn} == {"capsule", "box", "cylinder", "pad"}
-    for kind, at, place in drawn:
-        where = placed.ravel()[at:] if kind == "capsule" else placed.ravel()[at + 9 :]
-        found = points.ravel()[at:] if kind == "pad" else where
-        assert np.allclose(place, found[:3], atol=1e-9)
+    shapes = page.evaluate("[...casadiIk.now.solving.solver.shapes(casadiIk.now.shown)]")
+    assert np.abs(np.array(shapes) - placed.ravel()).max() < 1e-12
+    assert len(drawn_poses) > 20
+    assert {kind for kind, _, _ in drawn_poses} == {"capsule", "box", "cylinder", "pad"}
+    for kind, at, place in drawn_poses:
+        coordinates = placed.ravel()[at:] if kind == "capsule" else placed.ravel()[at + 9 :]
+        nearest_points = points.ravel()[at:] if kind == "pad" else coordinates
+        assert np.allclose(place, nearest_points[:3], atol=1e-9)
 
 
 def a_normal_turns(page: Page) -> None:
-    turned = "casadiIk.now.normals[1].toArray()"
-    before = page.evaluate(turned)
+    normal_expression = "casadiIk.now.normals[1].toArray()"
+    normal_before = page.evaluate(normal_expression)
     x, y = page.evaluate("casadiIk.pixel('normal 1')")
     page.drag((x, y), (x + 6, y + 4), steps=3)
     settled(page)
-    after = page.evaluate(turned)
+    after = page.evaluate(normal_expression)
     assert np.linalg.norm(after) == pytest.approx(1.0)
-    assert 0.02 < np.linalg.norm(np.subtract(after, before)) < 0.6
+    assert 0.02 < np.linalg.norm(np.subtract(after, normal_before)) < 0.6
 
 
 def the_object_takes_its_contacts_along(page: Page) -> None:
-    before = asked(page)
+    q_before = joint_positions(page)
     x, y = page.evaluate("casadiIk.pixel('object')")
     assert page.evaluate(f"casadiIk.under({x}, {y})") == "object"
     page.drag((x, y), (x + 25, y), steps=4)
     settled(page)
-    moved = asked(page) - before
-    assert np.linalg.norm(moved[0]) > 5e-3
-    assert np.ptp(moved, axis=0).max() < 1e-9
+    steps = joint_positions(page) - q_before
+    assert np.linalg.norm(steps[0]) > 5e-3
+    assert np.ptp(steps, axis=0).max() < 1e-9
 
 
 def steps_are_taken_back(page: Page) -> None:
     """Keys move the object 5 mm up; undone, done again."""
-    before = asked(page)
+    q_before = joint_positions(page)
     page.evaluate("document.getElementById('canvas').focus()")
     pressed(page, "Escape")
     pressed(page, "ArrowUp")
     settled(page)
     up = [0.0, 0.0, 5e-3]
-    assert np.allclose(asked(page) - before, up, atol=1e-9)
+    assert np.allclose(joint_positions(page) - q_before, up, atol=1e-9)
     pressed(page, "z", CONTROL)
     settled(page)
-    assert np.allclose(asked(page), before, atol=1e-9)
+    assert np.allclose(joint_positions(page), q_before, atol=1e-9)
     pressed(page, "z", CONTROL + SHIFT)
     settled(page)
-    assert np.allclose(asked(page) - before, up, atol=1e-9)
+    assert np.allclose(joint_positions(page) - q_before, up, atol=1e-9)
 
 
 CONTROL, SHIFT = 2, 8
 """As DevTools counts what is held."""
 
 
-def pressed(page: Page, key: str, held: int = 0) -> None:
+def pressed(page: Page, key: str, duration: int = 0) -> None:
     for kind in ("keyDown", "keyUp"):
-        page.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, modifiers=held)
+        page.call("Input.dispatchKeyEvent", type=kind, key=key, code=key, modifiers=duration)
 
 
 def copied(page: Page, button: str) -> str:
@@ -165,24 +165,26 @@ def the_answer_is_copied(page: Page) -> None:
 
 def a_link_has_the_question(page: Page, browser: Browser, url: str) -> None:
     """What is asked is asked by whoever opens the link; a broken one is said to be broken."""
-    shown = "[...casadiIk.now.shown]"
+    shown_expression = "[...casadiIk.now.shown]"
     page.evaluate("document.getElementById('reset').click()")
     pressed(page, "ArrowUp")
     settled(page)
-    other = opened(browser, copied(page, "link"), 900, 600)
-    assert np.allclose(asked(other), asked(page), atol=1e-4)
-    assert np.allclose(other.evaluate(shown), page.evaluate(shown), atol=2e-3)
-    assert now(other, "answer.status") == ik.Status.SOLVED
-    said = "document.getElementById('note').textContent"
-    other = opened(browser, f"{url}#robot={ROBOT}&grasp=apple&points=1,nan,2", 900, 600)
-    assert "points: found 1 of the 3 fingers" in other.evaluate(said)
-    other = opened(browser, f"{url}#robot=<b>none</b>&grasp=apple", 900, 600)
-    assert "is not on this page" in other.evaluate(said)
+    linked_page = opened(browser, copied(page, "link"), 900, 600)
+    assert np.allclose(joint_positions(linked_page), joint_positions(page), atol=1e-4)
+    assert np.allclose(
+        linked_page.evaluate(shown_expression), page.evaluate(shown_expression), atol=2e-3
+    )
+    assert current(linked_page, "answer.status") == ik.Status.SOLVED
+    note_text = "document.getElementById('note').textContent"
+    linked_page = opened(browser, f"{url}#robot={ROBOT}&grasp=apple&points=1,nan,2", 900, 600)
+    assert "points: found 1 of the 3 fingers" in linked_page.evaluate(note_text)
+    linked_page = opened(browser, f"{url}#robot=<b>none</b>&grasp=apple", 900, 600)
+    assert "is not on this page" in linked_page.evaluate(note_text)
 
 
 def out_of_reach_is_explained(page: Page) -> None:
     height = "document.querySelector('.verdict').offsetHeight"
-    before = page.evaluate(height)
+    height_before = page.evaluate(height)
     for _ in range(3):
         x, y = page.evaluate("casadiIk.pixel('object')")
         page.mouse("Wheel", x, y, deltaX=0, deltaY=240)
@@ -191,10 +193,10 @@ def out_of_reach_is_explained(page: Page) -> None:
     page.drag((x, y), (530 if x < 270 else 10, 590 if y < 300 else 10), steps=3)
     settled(page)
     assert page.evaluate("document.getElementById('status').textContent") == "not reached"
-    said = page.evaluate("document.getElementById('reason').textContent")
-    assert said.startswith("Out of reach: ")
-    assert "apart" in said
-    assert page.evaluate(height) == before
+    reason_text = page.evaluate("document.getElementById('reason').textContent")
+    assert reason_text.startswith("Out of reach: ")
+    assert "apart" in reason_text
+    assert page.evaluate(height) == height_before
     unchecked = page.evaluate("document.getElementById('clearance').textContent")
     assert unchecked == "collision not checked"
     page.evaluate("document.getElementById('reset').click()")
@@ -212,26 +214,28 @@ def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
         x, y = page.evaluate("casadiIk.pixel('obstacle')")
         page.drag((x, y), (x + part * (goal[0] - x), y + part * (goal[1] - y)), steps=3)
         settled(page)
-        apple, post = (now(page, f"{name}.solids[0]") for name in ("object", "obstacle"))
+        apple, post = (current(page, f"{name}.solids[0]") for name in ("object", "obstacle"))
         assert isinstance(apple, dict)
         assert isinstance(post, dict)
         ball = {"kind": "sphere", "radius": apple["size"][0], "xyz": apple["pose"][9:]}
         box = {"kind": "box", "size": post["size"], "xyz": post["pose"][9:]}
         scene = ik.Scene({"apple": ball, "post": box}, grasped="apple")
-        solver, points = ik.Solver(robot, scene=scene), asked(page)[None]
+        solver, points = ik.Solver(robot, scene=scene), joint_positions(page)[None]
         problems = solver._request.of_arrays(points, np.full_like(points, np.nan), None)
         around = solver._engine.collision_query(problems)
         assert around is not None
         q = np.array(page.evaluate("[...casadiIk.now.answer.q]"))
         clear = around.check(q[None])
-        assert now(page, "answer.clearance") == pytest.approx(float(clear.distance[0]), abs=1e-9)
-        ends.add(now(page, "answer.status"))
-        assert (now(page, "answer.status") == ik.Status.SOLVED) == bool(clear.free[0])
+        assert current(page, "answer.clearance") == pytest.approx(
+            float(clear.distance[0]), abs=1e-9
+        )
+        ends.add(current(page, "answer.status"))
+        assert (current(page, "answer.status") == ik.Status.SOLVED) == bool(clear.free[0])
     assert ik.Status.SOLVED in ends
 
 
 def used_by_mouse(page: Page, robot: ik.ArmHand, browser: Browser, url: str) -> None:
-    assert now(page, "answer.status") == ik.Status.SOLVED
+    assert current(page, "answer.status") == ik.Status.SOLVED
     assert page.evaluate("document.title").startswith("apple · ")
     the_page_follows(page, robot)
     page.wait("/^[0-9.]+ (µs|ms)$/.test(document.getElementById('time').textContent)")
@@ -247,11 +251,11 @@ def used_by_mouse(page: Page, robot: ik.ArmHand, browser: Browser, url: str) -> 
 
 def used_on_a_phone(page: Page) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") == 360
-    before = asked(page)
+    q_before = joint_positions(page)
     x, y = page.evaluate("casadiIk.pixel('point 0')")
     page.touch((x, y), (x + 6, y - 5), steps=3)
     settled(page)
-    assert np.linalg.norm(asked(page)[0] - before[0]) > 2e-3
+    assert np.linalg.norm(joint_positions(page)[0] - q_before[0]) > 2e-3
     assert page.evaluate("document.getElementById('canvas').clientHeight") > 300
     assert page.complaints == []
 
@@ -267,14 +271,14 @@ def two_hands_hold(page: Page) -> None:
     assert len(set(page.evaluate(dots))) == len(robot.fingers) == 6
     side = "document.querySelector('aside')"
     assert page.evaluate(f"{side}.scrollWidth <= {side}.clientWidth")
-    before = asked(page)
+    q_before = joint_positions(page)
     x, y = page.evaluate("casadiIk.pixel('point 3')")
     page.drag((x, y), (x + 3, y - 3), steps=2)
     settled(page)
-    after = asked(page)
-    assert np.linalg.norm(after[3] - before[3]) > 1e-3
-    assert np.array_equal(after[:3], before[:3])
-    assert now(page, "answer.status") == ik.Status.SOLVED
+    after = joint_positions(page)
+    assert np.linalg.norm(after[3] - q_before[3]) > 1e-3
+    assert np.array_equal(after[:3], q_before[:3])
+    assert current(page, "answer.status") == ik.Status.SOLVED
     points, _ = robot.contacts(np.array(page.evaluate("[...casadiIk.now.answer.q]")))
     assert np.linalg.norm(points - after, axis=1).max() <= 5.001e-3
     assert page.complaints == []
@@ -284,8 +288,8 @@ def as_in_python(module: Path) -> None:
     """The exported module gives the stored answers bit for bit, in its scene if it has one."""
     done = subprocess.run(["node", "test.mjs"], cwd=module, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    said = json.loads(done.stdout)
-    assert (said["targets"], said["wrong"], said["refused"]) == (1000, 0, True)
+    report = json.loads(done.stdout)
+    assert (report["targets"], report["wrong"], report["refused"]) == (1000, 0, True)
 
 
 # One test, since building takes as long as all that is done with what was built.
@@ -295,10 +299,10 @@ def test_page(
     monkeypatch: pytest.MonkeyPatch,
     robot: ik.ArmHand,
 ) -> None:
-    out, kept = tmp_path / "page", tmp_path / "module"
-    build(out, kept, monkeypatch)
-    as_in_python(kept / ROBOT)
-    as_in_python(kept / checked_prefix(None, BODY))
+    out, module = tmp_path / "page", tmp_path / "module"
+    build(out, module, monkeypatch)
+    as_in_python(module / ROBOT)
+    as_in_python(module / checked_prefix(None, BODY))
     browser: Browser = request.getfixturevalue("browser")
     url = (out / "index.html").as_uri()
     used_by_mouse(opened(browser, url, 900, 600), robot, browser, url)
@@ -340,8 +344,8 @@ def test_a_hand_without_a_scene(tmp_path):
     (module / "use.mjs").write_text(WRAPPER)
     done = subprocess.run(["node", "use.mjs"], cwd=module, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    said = json.loads(done.stdout)
-    assert said["found"] == [True, True, True, True, True, False]
-    assert tuple(said["motors"]) == tuple(robot.actuators)
-    assert tuple(said["fingers"]) == tuple(robot.fingers)
+    report = json.loads(done.stdout)
+    assert report["found"] == [True, True, True, True, True, False]
+    assert tuple(report["motors"]) == tuple(robot.actuators)
+    assert tuple(report["fingers"]) == tuple(robot.fingers)
     assert "setSolid" not in (module / "arm.d.ts").read_text()

@@ -79,10 +79,10 @@ def test_units_of_another_dimension(tmp_path: Path, text: str, says: str) -> Non
 @pytest.mark.parametrize("size", [5e-324, 1e-300, 1e-160, 1e-9, 1.0, 1e155, 1e300, 1.7e308])
 def test_normals_of_any_length(size: float) -> None:
     direction = np.array([0.6, 0.0, -0.8])
-    found = ik.Contact([0, 0, 0], size * direction).normal
-    assert found is not None
+    normal = ik.Contact([0, 0, 0], size * direction).normal
+    assert normal is not None
     expected = size * direction / np.abs(size * direction).max()
-    np.testing.assert_allclose(found, expected / np.linalg.norm(expected), rtol=1e-15)
+    np.testing.assert_allclose(normal, expected / np.linalg.norm(expected), rtol=1e-15)
 
 
 def test_normals_of_any_length_in_a_batch(robot) -> None:
@@ -172,11 +172,11 @@ def refused(load: Callable[[], object]) -> None:
     try:
         load()
     except ik.errors.CasadiIKError as error:
-        said = str(error)
+        message = str(error)
     else:
         return
-    assert len(said) <= ik.errors.MAX_MESSAGE_LENGTH
-    assert said.isprintable()
+    assert len(message) <= ik.errors.MAX_MESSAGE_LENGTH
+    assert message.isprintable()
 
 
 @settings(max_examples=150, deadline=None, derandomize=True, database=None)

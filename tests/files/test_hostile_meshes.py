@@ -50,8 +50,8 @@ def tetrahedron(folder: Path, kind: str) -> Path:
     if kind == "ascii_stl":
         mesh.export(path, file_type="stl_ascii")
     else:
-        more = {"encoding": "ascii"} if kind == "ascii_ply" else {}
-        mesh.export(path, file_type=path.suffix[1:], **more)
+        options = {"encoding": "ascii"} if kind == "ascii_ply" else {}
+        mesh.export(path, file_type=path.suffix[1:], **options)
     return path
 
 
@@ -69,8 +69,8 @@ def scene(mesh: Path, scale: float = 0.01) -> Path:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_mesh_is_read_in_metres(tmp_path: Path, kind: str) -> None:
     path = tetrahedron(tmp_path, kind)
-    found = ik.load_scene(scene(path, 1.0 if kind == "dae" else 0.01))
-    ((solid, pose),) = found.items["body"].parts
+    scene_items = ik.load_scene(scene(path, 1.0 if kind == "dae" else 0.01))
+    ((solid, pose),) = scene_items.items["body"].parts
     corners = CORNERS / 100 + [0.01 if kind == "dae" else 0, 0, 0] - pose[:3, 3]
     outside = corners @ solid.planes[:, :3].T - solid.planes[:, 3]
     np.testing.assert_allclose(np.sort(outside)[:, -3:], 0, atol=1e-7)  # each on three planes
@@ -81,19 +81,19 @@ SHARDS = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f", b"nan", b"-
 
 def damaged(data: bytes, rng: random.Random) -> bytes:
     """A file's bytes, of which some are lost, doubled, changed or said to be more."""
-    found = bytearray(data)
+    changed_data = bytearray(data)
     for _ in range(rng.choice((1, 2, 8))):
-        i = rng.randrange(len(found) + 1)
+        i = rng.randrange(len(changed_data) + 1)
         match rng.randrange(4):
             case 0:
-                del found[i : i + rng.choice((1, 4, 40))]
+                del changed_data[i : i + rng.choice((1, 4, 40))]
             case 1:
-                found[i:i] = found[: rng.choice((1, 4, 40))]
+                changed_data[i:i] = changed_data[: rng.choice((1, 4, 40))]
             case 2:
-                found[i : i + 4] = rng.choice(SHARDS)
+                changed_data[i : i + 4] = rng.choice(SHARDS)
             case _:
-                found = found[:i] if i > len(found) / 2 else found
-    return bytes(found)
+                changed_data = changed_data[:i] if i > len(changed_data) / 2 else changed_data
+    return bytes(changed_data)
 
 
 def test_broken_meshes_end_no_process(tmp_path: Path) -> None:

@@ -121,28 +121,28 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 def changed(data: Any, path: tuple[Any, ...]) -> Iterator[Any]:
     """The data with what stands at a place left out, renamed, or something else."""
-    *way, last = path
+    *parents, last = path
 
     def copied() -> tuple[Any, Any]:
-        whole = copy.deepcopy(data)
-        inner = whole
-        for key in way:
+        data_copy = copy.deepcopy(data)
+        inner = data_copy
+        for key in parents:
             inner = inner[key]
-        return whole, inner
+        return data_copy, inner
 
-    whole, inner = copied()
+    copied_data, inner = copied()
     del inner[last]
-    yield whole
+    yield copied_data
     if isinstance(last, str):
-        whole, inner = copied()
+        copied_data, inner = copied()
         inner[f"{last}_"] = inner.pop(last)
-        yield whole
+        yield copied_data
     # In which unit a joint's limits are is a matter of its type, which a schema does not see.
     units = ("1 kg",) if {"limits", "velocity"} & {*path} else ("3 deg", "3 mm", "-3 mm", "1 kg")
-    for other in ("some text", *units, 0.5, -0.5, None, [1, 2], {"some": "mapping"}):
-        whole, inner = copied()
-        inner[last] = other
-        yield whole
+    for replacement in ("some text", *units, 0.5, -0.5, None, [1, 2], {"some": "mapping"}):
+        copied_data, inner = copied()
+        inner[last] = replacement
+        yield copied_data
 
 
 @pytest.mark.parametrize("kind", FILES)
@@ -171,30 +171,30 @@ def test_shipped_files_validate(kind: str) -> None:
 @pytest.mark.parametrize("kind", FILES)
 def test_schema_and_reader_agree(kind: str) -> None:
     """Every key left out, misspelt, or with another value: both take it, or neither does."""
-    some = [EXAMPLES[kind]] if kind in EXAMPLES else []
+    examples = [EXAMPLES[kind]] if kind in EXAMPLES else []
     if kind in FOLDERS:
         # In which unit a sliding joint's limits are is a matter of its type.
         turning = [path for path in shipped(kind) if "prismatic" not in path.read_text()]
         smallest = min(turning, key=lambda path: path.stat().st_size)
-        some.append(small(loaded(smallest)))
-    taken = refused = 0
-    for data in some:
+        examples.append(small(loaded(smallest)))
+    accepted_count = refused = 0
+    for data in examples:
         assert reads(kind, data)
         assert checker(kind).is_valid(data)
         for path in places(data):
-            for other in changed(data, path):
-                expected = reads(kind, other)
-                assert checker(kind).is_valid(other) == expected, (path, other)
-                taken, refused = taken + expected, refused + (not expected)
-    assert taken > 10
+            for variant in changed(data, path):
+                expected = reads(kind, variant)
+                assert checker(kind).is_valid(variant) == expected, (path, variant)
+                accepted_count, refused = accepted_count + expected, refused + (not expected)
+    assert accepted_count > 10
     assert refused > 30
 
 
 @pytest.mark.parametrize("kind", FILES)
 def test_every_key_is_explained(kind: str) -> None:
-    for name, one in schema_of(kind)["definitions"].items():
-        for key, said in one.get("properties", {}).items():
-            assert "const" in said or said.get("description"), f"{name}.{key}"
+    for name, definition in schema_of(kind)["definitions"].items():
+        for key, property_schema in definition.get("properties", {}).items():
+            assert "const" in property_schema or property_schema.get("description"), f"{name}.{key}"
 
 
 def test_every_file_of_the_catalogue_is_of_a_kind() -> None:

@@ -61,9 +61,9 @@ def test_arrays_mark_what_is_free() -> None:
 
 
 def test_contacts_of_a_grasp_cannot_be_changed() -> None:
-    given = {"a": ik.Contact([4, 5, 6])}
-    grasp = ik.Grasp(given)
-    given.clear()
+    contacts = {"a": ik.Contact([4, 5, 6])}
+    grasp = ik.Grasp(contacts)
+    contacts.clear()
     assert tuple(grasp.contacts) == ("a",)
     with pytest.raises(TypeError):
         grasp.contacts["b"] = ik.Contact([0, 0, 0])  # pyright: ignore[reportIndexIssue]

@@ -34,10 +34,10 @@ ALL_KINDS = ik.Grasp(
 FINGERS = ("a", "b", "c", "d", "free")
 
 
-def assert_same(one: ik.Grasp, other: ik.Grasp) -> None:
-    arrays = (*one.arrays(FINGERS), *one.more(FINGERS).values())
-    others = (*other.arrays(FINGERS), *other.more(FINGERS).values())
-    for left, right in zip(arrays, others, strict=True):
+def assert_same(grasp: ik.Grasp, other_grasp: ik.Grasp) -> None:
+    arrays = (*grasp.arrays(FINGERS), *grasp.more(FINGERS).values())
+    other_arrays = (*other_grasp.arrays(FINGERS), *other_grasp.more(FINGERS).values())
+    for left, right in zip(arrays, other_arrays, strict=True):
         np.testing.assert_allclose(left, right, atol=1e-12)
 
 
@@ -74,15 +74,15 @@ def test_back_where_it_was(pose):
 
 def test_a_grasp_that_knows_its_object_is_taken_along(robot):
     grasp = ik.load_grasp("cup")
-    there = np.eye(4)
-    there[:3, 3] = [0.02, -0.03, 0.04]
+    object_pose = np.eye(4)
+    object_pose[:3, 3] = [0.02, -0.03, 0.04]
     assert grasp.object_pose is not None
-    moved = grasp.in_object_frame().at(there @ grasp.object_pose)
+    moved_grasp = grasp.in_object_frame().at(object_pose @ grasp.object_pose)
     assert_same(
-        ik.Grasp(dict(zip(FINGERS, moved.contacts.values(), strict=False))),
-        ik.Grasp(dict(zip(FINGERS, grasp.at(there).contacts.values(), strict=False))),
+        ik.Grasp(dict(zip(FINGERS, moved_grasp.contacts.values(), strict=False))),
+        ik.Grasp(dict(zip(FINGERS, grasp.at(object_pose).contacts.values(), strict=False))),
     )
-    assert ik.Solver(robot).solve(moved).success
+    assert ik.Solver(robot).solve(moved_grasp).success
 
 
 @pytest.mark.parametrize(

@@ -131,9 +131,9 @@ def test_mesh_is_closed_and_faces_outward(shape: grasps.Shape) -> None:
     assert np.einsum("ij,ij->", a, np.cross(b, c)) > 0
     rng = np.random.default_rng(3)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    inside = shape.signed_distance(rng.uniform(low, high, (20000, 3))) < 0
+    is_inside = shape.signed_distance(rng.uniform(low, high, (20000, 3))) < 0
     volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-    assert volume == pytest.approx(inside.mean() * np.prod(high - low), rel=0.04)
+    assert volume == pytest.approx(is_inside.mean() * np.prod(high - low), rel=0.04)
 
 
 @pytest.mark.parametrize("shape", SHAPES, ids=shape_id)

@@ -49,21 +49,21 @@ def write_can(folder: Path, mesh: str = "meshes/can.stl") -> Path:
 @pytest.mark.parametrize("mesh", ["meshes/can.stl", "package://set/can/meshes/can.stl"])
 def test_the_visual_mesh_is_placed_and_scaled(tmp_path: Path, mesh: str) -> None:
     path = write_can(tmp_path, mesh)
-    thing = load_object(path) if "package" not in mesh else None
-    if thing is None:  # the package is not found: the mesh is looked for beside the URDF
+    body = load_object(path) if "package" not in mesh else None
+    if body is None:  # the package is not found: the mesh is looked for beside the URDF
         (tmp_path / "can").mkdir()
         (tmp_path / "meshes").rename(tmp_path / "can" / "meshes")
-        thing = load_object(path)
-    points, _ = thing.mesh()
+        body = load_object(path)
+    points, _ = body.mesh()
     assert points.min(axis=0) == pytest.approx([-0.033, -0.033, 0.05], abs=1e-4)
     assert points.max(axis=0) == pytest.approx([0.033, 0.033, 0.15], abs=1e-4)
-    assert thing.signed_distance([[0.1, 0.0, 0.1]]) == pytest.approx([0.067], abs=1e-3)
+    assert body.signed_distance([[0.1, 0.0, 0.1]]) == pytest.approx([0.067], abs=1e-3)
 
 
 def test_links_and_simple_shapes_make_one_body(tmp_path: Path) -> None:
     (tmp_path / "mobility.urdf").write_text(DRAWER)
-    thing = load_object(f"{tmp_path / 'mobility.urdf'}@0.5")
-    points, _ = thing.mesh()
+    body = load_object(f"{tmp_path / 'mobility.urdf'}@0.5")
+    points, _ = body.mesh()
     assert points[:, 2].max() == pytest.approx(0.025)
     knob = points[points[:, 2] > 0.006]
     assert (knob.min(axis=0) + knob.max(axis=0)) / 2 == pytest.approx(

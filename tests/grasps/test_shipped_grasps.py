@@ -73,20 +73,20 @@ def pads(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray]:
     return points, normals
 
 
-def moved(here: np.ndarray, there: np.ndarray) -> np.ndarray:
+def displacement(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """(4, 4) rigid motion that takes points, and directions as if fixed to them, nearest."""
-    middle, other = here.mean(axis=0), there.mean(axis=0)
-    left, _, right = np.linalg.svd((here - middle).T @ (there - other))
+    middle, end_middle = start.mean(axis=0), end.mean(axis=0)
+    left, _, right = np.linalg.svd((start - middle).T @ (end - end_middle))
     turn = right.T @ np.diag([1, 1, np.linalg.det(right.T @ left.T)]) @ left.T
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, other - turn @ middle
+    pose[:3, :3], pose[:3, 3] = turn, end_middle - turn @ middle
     return pose
 
 
 def test_every_object_and_hand_has_grasps() -> None:
-    found = [ik.load_grasp(name) for name in NAMES]
-    assert {grasp.object for grasp in found} == set(ik.shipped_names("objects"))
-    robots = [grasp.robot for grasp in found]
+    object_grasps = [ik.load_grasp(name) for name in NAMES]
+    assert {grasp.object for grasp in object_grasps} == set(ik.shipped_names("objects"))
+    robots = [grasp.robot for grasp in object_grasps]
     assert len(set(robots)) >= 8
     assert all(robots.count(name) >= 3 for name in robots)
 
@@ -114,7 +114,7 @@ def test_the_posture_keeps_limits_and_reproduces_the_contacts(name: str) -> None
     q, hand_points, hand_normals = posed(grasp)
     assert ((q >= robot.lower) & (q <= robot.upper)).all()
     points, normals = pads(grasp)
-    motion = moved(
+    motion = displacement(
         np.concatenate([hand_points, hand_points + 0.1 * hand_normals]),
         np.concatenate([points, points + 0.1 * normals]),
     )
@@ -149,8 +149,8 @@ def test_the_squeeze_stays_inside_friction_cones(name: str) -> None:
     # Barrett's pads tilt towards the palm below 131 mm, the more the smaller the object.
     box = isinstance(grasps.load_object(grasp.object).shape, grasps.Box)
     barrett = grasp.robot == "kuka_lwr_barrett"
-    most = (0.01 if box else 1.3) if barrett else 0.8 if grasp.robot == "baxter_ar10" else 2.0
-    assert np.tan(np.arccos(min(best, 1.0))) < most
+    max_force = (0.01 if box else 1.3) if barrett else 0.8 if grasp.robot == "baxter_ar10" else 2.0
+    assert np.tan(np.arccos(min(best, 1.0))) < max_force
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -11,7 +11,7 @@ import pytest
 
 import casadi_ik as ik
 
-LOST = {
+LOST_VALUES = {
     "NaN": np.full((4, 4), np.nan),
     "zeros": np.zeros((4, 4)),
     "minus one": -np.ones((4, 4)),
@@ -37,15 +37,15 @@ def lerobot(monkeypatch):
     sys.modules.pop("casadi_ik.integrations.lerobot", None)
 
 
-@pytest.mark.parametrize("name", LOST)
+@pytest.mark.parametrize("name", LOST_VALUES)
 def test_the_arm_of_lerobot_stays(lerobot, name):
     robot = ik.load_robot("ur5e")
     arm = lerobot.ArmKinematics(ik.Solver(robot))
-    now = np.rad2deg(robot.home)
-    np.testing.assert_array_equal(arm.inverse_kinematics(now, LOST[name]), now)
+    angles = np.rad2deg(robot.home)
+    np.testing.assert_array_equal(arm.inverse_kinematics(angles, LOST_VALUES[name]), angles)
     assert arm.status is ik.Status.INVALID
     rounded = np.round(robot.palm(robot.home), 3)
-    arm.inverse_kinematics(now, rounded)
+    arm.inverse_kinematics(angles, rounded)
     assert arm.status is ik.Status.SOLVED
 
 
@@ -63,12 +63,12 @@ def test_messages_of_ros_without_an_orientation_are_refused(robot):
     points, normals = robot.contacts(robot.home)
     message = bytearray(ros2.encode_contacts(points, normals))
     values = np.frombuffer(message, "<f8", offset=len(message) - 8 * 7 * len(points))
-    turned = values.reshape(-1, 7).copy()
-    start = len(message) - turned.nbytes
-    turned[:, 3:] *= 1.004  # two decimals
-    message[start:] = turned.tobytes()
+    without_orientation = values.reshape(-1, 7).copy()
+    start = len(message) - without_orientation.nbytes
+    without_orientation[:, 3:] *= 1.004  # two decimals
+    message[start:] = without_orientation.tobytes()
     np.testing.assert_allclose(ros2.decode_contacts(bytes(message))[1], normals, atol=1e-12)
-    turned[1, 3:] = 0.0
-    message = message[:start] + turned.tobytes()
+    without_orientation[1, 3:] = 0.0
+    message = message[:start] + without_orientation.tobytes()
     with pytest.raises(ik.errors.InvalidPoseError, match=r"poses\[1\]"):
         ros2.decode_contacts(bytes(message))

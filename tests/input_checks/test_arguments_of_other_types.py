@@ -28,7 +28,7 @@ def test_candidates_that_are_none(solver: ik.Solver, grasp: ik.Grasp, of: Callab
 
 
 def test_candidates_of_a_generator(solver: ik.Solver, grasp: ik.Grasp) -> None:
-    ranking = solver.choose(each for each in (grasp, ik.load_grasp("apple")))
+    ranking = solver.choose(candidate for candidate in (grasp, ik.load_grasp("apple")))
     assert (ranking.candidates, ranking.answered) == (2, 2)
 
 

@@ -19,10 +19,10 @@ from casadi_ik.files.input_checks.keypoint_orders import (
     recognise_order,
 )
 
-OTHERS = [name for name in KEYPOINT_ORDERS if name != STANDARD_ORDER]
+OTHER_ORDERS = [name for name in KEYPOINT_ORDERS if name != STANDARD_ORDER]
 
 
-def seen(i: int = 0) -> np.ndarray:
+def keypoint_frame(i: int = 0) -> np.ndarray:
     """(21, 3) a hand that moves and bends, with noise of a millimetre."""
     noise = np.random.default_rng(i).normal(0, 1e-3, (21, 3))
     return hand(0.2 + 0.05 * i, np.array([0.5, 0.01 * i, 0.9]), 0.1 * i) + noise
@@ -30,9 +30,9 @@ def seen(i: int = 0) -> np.ndarray:
 
 def reordered(frames: np.ndarray, name: str) -> np.ndarray:
     """Frames (..., 21, 3) in another order."""
-    found = np.empty_like(frames)
-    found[..., KEYPOINT_ORDERS[name], :] = frames
-    return found
+    result = np.empty_like(frames)
+    result[..., KEYPOINT_ORDERS[name], :] = frames
+    return result
 
 
 @pytest.fixture(scope="module")
@@ -59,40 +59,40 @@ def test_every_order_is_recognised_in_one_frame(name, bend, size, seed, mirrored
     assert recognise_order(reordered(frame, name)[None]) == name
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", OTHER_ORDERS)
 def test_a_retargeter_converts_them(robot, config, name):
-    plain, other = (ik.motion.Retargeter(config, robot) for _ in range(2))
-    expected = [plain(seen(i)) for i in range(4)]
+    plain, converting = (ik.motion.Retargeter(config, robot) for _ in range(2))
+    expected = [plain(keypoint_frame(i)) for i in range(4)]
     with pytest.warns(InputWarning, match="order"):
-        found = [other(reordered(seen(0), name))]
+        targets = [converting(reordered(keypoint_frame(0), name))]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found += [other(reordered(seen(i), name)) for i in range(1, 4)]
-    for one, another in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.points, another.points)
-        np.testing.assert_array_equal(one.palm, another.palm)
+        targets += [converting(reordered(keypoint_frame(i), name)) for i in range(1, 4)]
+    for target, expected_target in zip(targets, expected, strict=True):
+        np.testing.assert_array_equal(target.points, expected_target.points)
+        np.testing.assert_array_equal(target.palm, expected_target.palm)
 
 
 def test_lost_frames_before_tell_no_order(robot, config):
-    plain, other = (ik.motion.Retargeter(config, robot) for _ in range(2))
-    for lost in (np.zeros((21, 3)), -np.ones((21, 3)), np.full((21, 3), np.nan)):
-        assert other(lost).reason
+    plain, converting = (ik.motion.Retargeter(config, robot) for _ in range(2))
+    for lost_frame in (np.zeros((21, 3)), -np.ones((21, 3)), np.full((21, 3), np.nan)):
+        assert converting(lost_frame).reason
     with pytest.warns(InputWarning, match="MANO"):
-        found = other(reordered(seen(), "MANO, HO-3D"))
-    np.testing.assert_array_equal(found.points, plain(seen()).points)
+        target = converting(reordered(keypoint_frame(), "MANO, HO-3D"))
+    np.testing.assert_array_equal(target.points, plain(keypoint_frame()).points)
 
 
 def test_the_usual_order_and_unknown_ones(robot, config):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        ik.motion.Retargeter(config, robot)(seen())
-    mixed = seen()[np.random.default_rng(0).permutation(21)]
+        ik.motion.Retargeter(config, robot)(keypoint_frame())
+    mixed = keypoint_frame()[np.random.default_rng(0).permutation(21)]
     with pytest.warns(InputWarning, match="none of the known orders"):
         ik.motion.Retargeter(config, robot)(mixed)
 
 
 def test_a_recording_in_the_order_of_mano(tmp_path, capsys):
-    frames = np.array([seen(i) for i in range(12)])
+    frames = np.array([keypoint_frame(i) for i in range(12)])
     motions = []
     for keypoints in (frames, reordered(frames, "MANO, HO-3D")):
         path, out = tmp_path / "frames.npz", tmp_path / "motion.npz"

@@ -15,19 +15,19 @@ HOLDING = ik.motion.FollowStatus.HOLDING
 KEYS = {"thumb": 4, "finger_2": 8, "finger_3": 12}
 
 
-def seen(i: int = 0) -> np.ndarray:
+def keypoints(i: int = 0) -> np.ndarray:
     """(21, 3) keypoints of a hand a metre away that moves slowly."""
     return hand(0.4, np.array([0.6, -0.3 + 0.002 * i, 0.9]))
 
 
 def with_key(key: int, place: np.ndarray) -> np.ndarray:
     """(21, 3) the same hand with one keypoint elsewhere."""
-    frame = seen()
+    frame = keypoints()
     frame[key] = place
     return frame
 
 
-LOST = {
+LOST_FRAMES = {
     "NaN": np.full((21, 3), np.nan),
     "zeros": np.zeros((21, 3)),
     "minus one": -np.ones((21, 3)),
@@ -37,12 +37,12 @@ LOST = {
     "a tip at zero": with_key(8, np.zeros(3)),
     "a tip at minus one": with_key(4, -np.ones(3)),
     "a wrist at zero": with_key(0, np.zeros(3)),
-    "two tips in one place": with_key(8, seen()[12]),
+    "two tips in one place": with_key(8, keypoints()[12]),
     "a line": np.outer(np.arange(21.0), [0.01, 0.02, 0.0]),
 }
 ODD = {
-    "a tip half a metre away": with_key(12, seen()[12] + [0.3, 0.4, 0.0]),
-    "a hand that jumps": seen() + np.array([1.0, 0.0, 0.0]),
+    "a tip half a metre away": with_key(12, keypoints()[12] + [0.3, 0.4, 0.0]),
+    "a hand that jumps": keypoints() + np.array([1.0, 0.0, 0.0]),
 }
 """What only other frames tell."""
 
@@ -59,22 +59,22 @@ def solver(robot):
     return ik.Solver(robot)
 
 
-@pytest.mark.parametrize("name", LOST)
+@pytest.mark.parametrize("name", LOST_FRAMES)
 @pytest.mark.parametrize("first", [True, False])
 def test_a_lost_hand_is_held_first_or_later(robot, solver, config, name, first):
     """Good frames give what they give without the lost one."""
     retargeter, plain = (ik.motion.Retargeter(config, robot) for _ in range(2))
     follower = solver.follow(robot.home, period=1 / 30)
     if not first:
-        retargeter(seen())
-        plain(seen())
-    lost = retargeter(LOST[name])
-    assert lost.reason
-    assert lost.palm is None
-    follower(lost.points, palm=lost.palm)
+        retargeter(keypoints())
+        plain(keypoints())
+    target = retargeter(LOST_FRAMES[name])
+    assert target.reason
+    assert target.palm is None
+    follower(target.points, palm=target.palm)
     assert follower.state.status is HOLDING
     for i in range(1, 4):
-        good, expected = retargeter(seen(i)), plain(seen(i))
+        good, expected = retargeter(keypoints(i)), plain(keypoints(i))
         assert not good.reason
         np.testing.assert_array_equal(good.points, expected.points)
         follower(good.points, palm=good.palm)
@@ -85,16 +85,16 @@ def test_a_lost_hand_is_held_first_or_later(robot, solver, config, name, first):
 def test_what_differs_from_other_frames_is_held(robot, config, name):
     retargeter = ik.motion.Retargeter(config, robot)
     for i in range(3):
-        assert not retargeter(seen(i)).reason
+        assert not retargeter(keypoints(i)).reason
     for _ in range(3):
         assert retargeter(ODD[name], elapsed=0.005).reason
-    assert not retargeter(seen(3)).reason
+    assert not retargeter(keypoints(3)).reason
 
 
 def test_a_hand_that_is_seen_again_elsewhere_is_followed(robot, config):
     retargeter = ik.motion.Retargeter(config, robot)
-    retargeter(seen())
-    accepted = [not retargeter(seen(i) + np.array([1.0, 0.0, 0.0])).reason for i in range(8)]
+    retargeter(keypoints())
+    accepted = [not retargeter(keypoints(i) + np.array([1.0, 0.0, 0.0])).reason for i in range(8)]
     assert not accepted[0]
     assert accepted[-1]
 
@@ -108,9 +108,9 @@ def test_one_lost_hand_of_two(config):
         ik.motion.load_retarget(models / "two_hands_g1.yaml"), g1, g1.home
     )
     retargeter({side: rows[0] for side, rows in frames.items()})
-    wanted = retargeter({"left": frames["left"][1], "right": np.zeros((26, 3))})
-    assert list(wanted.palm) == ["left"]
-    assert wanted.reason.startswith("right: ")
+    target = retargeter({"left": frames["left"][1], "right": np.zeros((26, 3))})
+    assert list(target.palm) == ["left"]
+    assert target.reason.startswith("right: ")
 
 
 PALMS = {
@@ -144,14 +144,14 @@ def test_lost_contacts_are_held_by_a_follower(robot, solver, number):
 
 def test_a_recording_with_lost_frames_is_followed(robot, tmp_path, capsys):
     """Frames between which the hand was lost are not mixed with it."""
-    frames = np.array([seen(i) for i in range(30)])
-    for i, lost in enumerate((*LOST.values(), *ODD.values())):
-        frames[2 * i + (i > 0)] = lost
+    frames = np.array([keypoints(i) for i in range(30)])
+    for i, lost_frame in enumerate((*LOST_FRAMES.values(), *ODD.values())):
+        frames[2 * i + (i > 0)] = lost_frame
     path, out = tmp_path / "frames.npz", tmp_path / "motion.npz"
     np.savez(path, keypoints=frames)
     words = ["follow", path, "--robot", "kuka_lwr_barrett", "--period", "0.01", "--out", out]
     assert main([str(word) for word in words]) == 1
-    assert f"{len(LOST) + len(ODD)} of 30" in " ".join(capsys.readouterr().out.split())
+    assert f"{len(LOST_FRAMES) + len(ODD)} of 30" in " ".join(capsys.readouterr().out.split())
     motion = np.load(out)
     assert {"holding"} < set(motion["status"][1:])
     # The hand moves by 2 mm a frame: nothing of the robot goes farther than that asks for.

@@ -199,12 +199,12 @@ def test_rounded_quaternions_are_taken_at_every_entrance(wxyz, decimals):
 
 @FEW
 @given(unit, unit, st.floats(MAX_SKEW * 1.01, 10.0), st.booleans())
-def test_the_limit_is_the_same_at_every_entrance(wxyz, other, skew, mirrored):
+def test_the_limit_is_the_same_at_every_entrance(wxyz, other_axis, skew, mirrored):
     """A stretched or a mirrored rotation is refused: the largest entry of |R^T R - I| counts."""
     stretch = np.diag([1.0, 1.0, np.sqrt(1 + skew)])
     matrix = matrix_of(wxyz) @ stretch
     if mirrored:
-        matrix = matrix_of(other) @ np.diag([1.0, -1.0, 1.0])
+        matrix = matrix_of(other_axis) @ np.diag([1.0, -1.0, 1.0])
     for name, entrance in MATRICES.items():
         if name == "axes of a contact":
             continue  # whose third axis follows from the others

@@ -121,8 +121,12 @@ def test_tolerances_that_cause_no_warning(robot):
 def test_a_mobile_base_may_go_far():
     body = ik.load_robot("mobile_kuka_lwr_barrett")
     points, normals = body.contacts(body.home)
-    travel = [body.upper[i] for i, one in enumerate(body.description.actuators) if one.unit == "m"]
-    far = points + np.array([max(travel), 0.0, 0.0])
+    travel = [
+        body.upper[i]
+        for i, actuator in enumerate(body.description.actuators)
+        if actuator.unit == "m"
+    ]
+    far_points = points + np.array([max(travel), 0.0, 0.0])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        ik.Solver(body).solve_batch(far[None], normals[None])
+        ik.Solver(body).solve_batch(far_points[None], normals[None])

@@ -79,8 +79,8 @@ def random_step(seed: int = 0, turning: bool = True) -> StepGraph:
     noise = random_expression(ca.vertcat(x, p), 4, 120, seed, turning)
     mixed = 3 * noise + 4 * x
     # A parabola of the rest folds as a sine does.
-    rest = mixed - 2 * ca.floor(mixed / 2 + 0.5)
-    new = 2 * ca.sin(mixed) if turning else 2 - 4 * rest * rest
+    remainder = mixed - 2 * ca.floor(mixed / 2 + 0.5)
+    new = 2 * ca.sin(mixed) if turning else 2 - 4 * remainder * remainder
     status = ca.if_else(ca.fabs(new[0] - p[1]) < 0.01, DONE, RUNNING)
     name = "random_step" if turning else "random_parabola"
     function = ca.Function(name, [x, p], [new, record_of(new, p), status])
@@ -93,9 +93,9 @@ def branching_step() -> StepGraph:
     left = ca.Function("left", [x, p], [ca.sin(3 * x) * p[0], record_of(x, p)])
     right = ca.Function("right", [x, p], [ca.sqrt(1 + x * x) - 2 * ca.cos(x), record_of(-x, p)])
     branch = ca.Function.conditional("branch", [left], right)
-    which = ca.Function("which", [x, p], [ca.sum1(x) > p[1]])
+    condition = ca.Function("which", [x, p], [ca.sum1(x) > p[1]])
     xm, pm = ca.MX.sym("x", 4), ca.MX.sym("p", 2)
-    new, record = branch(which(xm, pm), xm, pm)
+    new, record = branch(condition(xm, pm), xm, pm)
     status = ca.if_else(ca.fabs(new[0] - pm[1]) < 0.01, DONE, RUNNING)
     return step_of("branching_step", ca.Function("branching_step", [xm, pm], [new, record, status]))
 

@@ -16,12 +16,12 @@ from casadi_ik.compile import compiler
 def test_a_path_with_a_blank_has_to_be_quoted(
     options: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = shutil.which("cc") or shutil.which("gcc")
-    if found is None:
+    compiler_path = shutil.which("cc") or shutil.which("gcc")
+    if compiler_path is None:
         pytest.skip("needs a C compiler")
     program = tmp_path / "my tools" / "cc"
     program.parent.mkdir()
-    program.symlink_to(found)
+    program.symlink_to(compiler_path)
     forget(monkeypatch)
     monkeypatch.setenv("CC", f"{program}{options}")
     assert compiler.find_compiler() is None

@@ -40,15 +40,17 @@ def test_matrices_are_row_major(compiled, kind):
     assert kernel.output_shapes == ((2, 3), (3, 3), (2,), (1, 2), ())
     rng = np.random.default_rng(0)
     a, v, m = 1.5, rng.normal(size=3), rng.normal(size=(2, 3))
-    found = kernel(a, v, m)
-    wanted = (a * m, np.diag(v), m @ v, (m @ v)[None], v.sum())
-    for one, other in zip(found, wanted, strict=True):
-        assert one.flags.c_contiguous
-        assert one.shape == np.shape(other)
-        np.testing.assert_allclose(one, other, rtol=1e-14, atol=1e-14)
+    results = kernel(a, v, m)
+    expected = (a * m, np.diag(v), m @ v, (m @ v)[None], v.sum())
+    for result, expected_result in zip(results, expected, strict=True):
+        assert result.flags.c_contiguous
+        assert result.shape == np.shape(expected_result)
+        np.testing.assert_allclose(result, expected_result, rtol=1e-14, atol=1e-14)
     # Column-major input and lists are the same numbers.
-    for one, other in zip(kernel(a, v.tolist(), np.asfortranarray(m)), found, strict=True):
-        np.testing.assert_array_equal(one, other)
+    for result, expected_result in zip(
+        kernel(a, v.tolist(), np.asfortranarray(m)), results, strict=True
+    ):
+        np.testing.assert_array_equal(result, expected_result)
 
 
 @needs_compiler
@@ -58,18 +60,18 @@ def test_parts_are_called_with_what_is_there_or_put_together(in_lanes, rng):
     x, w = ca.SX.sym("x", 3), ca.SX.sym("w", 2)
     inner = call_function("inner", [x, w], [2 * ca.sin(x) + w[0], ca.sumsqr(x) * w[1]])
     y, z = ca.SX.sym("y", 3), ca.SX.sym("z", 4)
-    once, length = inner(y + 1, z[1:3])
-    again, _ = inner(once, z[1:3])
+    first, length = inner(y + 1, z[1:3])
+    second, _ = inner(first, z[1:3])
     swapped, _ = inner(y < 0, ca.vertcat(z[3], 0.5))
-    same, _ = inner(y + 1, z[1:3])
-    outputs = [again * length + swapped, same + once]
+    repeated, _ = inner(y + 1, z[1:3])
+    outputs = [second * length + swapped, repeated + first]
     function = ca.Function("with_parts", [y, z], outputs)
     kernel = FunctionKernel(function, in_lanes=in_lanes)
     assert kernel.compiled
-    given = rng.normal(size=(9, 3)), rng.normal(size=(9, 4))
-    wanted = FunctionKernel(function, compiled=False)(*given)
-    for one, other in zip(kernel(*given), wanted, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
+    inputs = rng.normal(size=(9, 3)), rng.normal(size=(9, 4))
+    expected = FunctionKernel(function, compiled=False)(*inputs)
+    for result, expected_result in zip(kernel(*inputs), expected, strict=True):
+        np.testing.assert_allclose(result, expected_result, rtol=1e-13, atol=1e-13)
     text = standalone_source(function, CodeOptions())
     assert text.count("CODE void f0_inner(") == 1
     assert text.count("f0_inner(") == 4
@@ -80,11 +82,11 @@ def test_batches_broadcast(compiled):
     kernel = FunctionKernel(matrices(ca.SX), compiled=compiled)
     rng = np.random.default_rng(1)
     a, v, m = rng.normal(size=5), rng.normal(size=3), rng.normal(size=(5, 2, 3))
-    found = kernel(a, v, m)
-    assert [output.shape for output in found] == [(5, 2, 3), (5, 3, 3), (5, 2), (5, 1, 2), (5,)]
+    results = kernel(a, v, m)
+    assert [output.shape for output in results] == [(5, 2, 3), (5, 3, 3), (5, 2), (5, 1, 2), (5,)]
     for i in range(5):
-        for one, other in zip(found, kernel(a[i], v, m[i]), strict=True):
-            np.testing.assert_array_equal(one[i], other)
+        for result, single_result in zip(results, kernel(a[i], v, m[i]), strict=True):
+            np.testing.assert_array_equal(result[i], single_result)
     assert [output.shape[0] for output in kernel(a[:1], v, m[0])] == [1] * 5
     assert [output.shape[0] for output in kernel(a[:0], v, m[0])] == [0] * 5
 
@@ -118,12 +120,12 @@ def test_threads_share_a_kernel(compiled):
     kernel = FunctionKernel(matrices(ca.MX), compiled=compiled)
     rng = np.random.default_rng(3)
     samples = [(rng.normal(), rng.normal(size=(40, 3)), rng.normal(size=(2, 3))) for _ in range(60)]
-    alone = [kernel(*sample) for sample in samples]
+    sequential = [kernel(*sample) for sample in samples]
     with ThreadPoolExecutor(6) as pool:
-        together = list(pool.map(lambda sample: kernel(*sample), samples))
-    for a, b in zip(alone, together, strict=True):
-        for one, other in zip(a, b, strict=True):
-            np.testing.assert_array_equal(one, other)
+        concurrent = list(pool.map(lambda sample: kernel(*sample), samples))
+    for a, b in zip(sequential, concurrent, strict=True):
+        for result, expected_result in zip(a, b, strict=True):
+            np.testing.assert_array_equal(result, expected_result)
 
 
 @BOTH
@@ -165,9 +167,9 @@ def graph() -> FunctionGraph:
 def test_any_number_of_samples(count, compiled):
     rng = np.random.default_rng(count)
     x = rng.normal(size=(count, 3)) * [10.0 ** rng.uniform(-8, 4), 1.0, 1.0]
-    (found,) = FunctionKernel(graph(), compiled, in_lanes=True)(x)
+    (values,) = FunctionKernel(graph(), compiled, in_lanes=True)(x)
     expected = np.stack([np.sin(x[:, 0]), np.cos(x[:, 0]), x[:, 1] * x[:, 2]], axis=1)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-12)
 
 
 pytestmark = needs_compiler
@@ -184,18 +186,18 @@ def functions() -> tuple[FunctionKernel, FunctionKernel]:
 
 
 def compare(functions: tuple[FunctionKernel, FunctionKernel], points: np.ndarray) -> None:
-    alone, beside = functions
-    (found,) = alone(points)
-    assert beside(points)[0].tobytes() == found.tobytes()
+    single_kernel, beside = functions
+    (values,) = single_kernel(points)
+    assert beside(points)[0].tobytes() == values.tobytes()
     x, y = points.T
     with np.errstate(all="ignore"):
         expected = [getattr(np, name.replace("a", "arc", 1) if name[0] == "a" else name)(x)
                     for name in OF_ONE]  # fmt: skip
         expected.append(np.arctan2(y, x))
         # Next to a multiple of pi the last places of a sine are those of pi.
-        off = np.abs(found - np.stack(expected, axis=1)) - 1e-22
+        off = np.abs(values - np.stack(expected, axis=1)) - 1e-22
         units = off / np.spacing(np.abs(expected)).T
-    assert (np.isnan(found) == np.isnan(np.stack(expected, axis=1))).all()
+    assert (np.isnan(values) == np.isnan(np.stack(expected, axis=1))).all()
     worst = np.nan_to_num(units).max(axis=0)
     assert worst[[0, 1, 3, 4, 5, 6]].max() <= 2, worst
     assert worst[2] <= 16, worst  # a quotient of two
@@ -220,9 +222,9 @@ def test_quarters_of_a_turn_and_their_edges(
 
 def test_signs_of_zero(functions):
     zeros = np.array([[x, y] for x in (0.0, -0.0, 2.0, -2.0) for y in (0.0, -0.0)])
-    found = functions[0](zeros)[0][:, -1]
-    np.testing.assert_array_equal(found, np.arctan2(zeros[:, 1], zeros[:, 0]))
-    np.testing.assert_array_equal(np.signbit(found), np.signbit(zeros[:, 1]))
+    last_column = functions[0](zeros)[0][:, -1]
+    np.testing.assert_array_equal(last_column, np.arctan2(zeros[:, 1], zeros[:, 0]))
+    np.testing.assert_array_equal(np.signbit(last_column), np.signbit(zeros[:, 1]))
 
 
 def test_one_lane_that_is_large_changes_no_other(
@@ -236,12 +238,12 @@ def test_one_lane_that_is_large_changes_no_other(
 @settings(max_examples=300, deadline=None)
 @given(st.floats(allow_subnormal=False), st.floats(-1e6, 1e6, allow_subnormal=False))
 def test_any_number(functions, x, y):
-    alone, beside = functions
+    single_kernel, beside = functions
     points = np.array([[x, y]] * 3)
-    (found,) = alone(points)
-    assert found.tobytes() == beside(points)[0].tobytes()
+    (values,) = single_kernel(points)
+    assert values.tobytes() == beside(points)[0].tobytes()
     if not np.isnan(x):
-        assert abs(found[0, -1] - np.arctan2(y, x)) <= 1e-15 * 4
+        assert abs(values[0, -1] - np.arctan2(y, x)) <= 1e-15 * 4
 
 
 COUNT = 7
@@ -250,12 +252,12 @@ COUNT = 7
 
 def agree(function: ca.Function, samples: np.ndarray, rtol: float = 1e-13) -> np.ndarray:
     """Values of a function of one vector: compiled, side by side and in the virtual machine."""
-    (found,) = FunctionKernel(function)(samples)
+    (values,) = FunctionKernel(function)(samples)
     (expected,) = FunctionKernel(function, compiled=False)(samples)
     (beside,) = FunctionKernel(function, in_lanes=True)(samples)
-    assert beside.tobytes() == found.tobytes()
-    np.testing.assert_allclose(found, expected, rtol=rtol, atol=1e-15)
-    return found
+    assert beside.tobytes() == values.tobytes()
+    np.testing.assert_allclose(values, expected, rtol=rtol, atol=1e-15)
+    return values
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -272,11 +274,11 @@ def test_calls_and_branches():
         ca.Function(f"case_{i}", [x, y, m], [x * (i + 1) + y, m @ ca.sin(x), ca.SX(i)])
         for i in range(4)
     ]
-    several = ca.Function.conditional("several", cases[:-1], cases[-1])
+    switch = ca.Function.conditional("several", cases[:-1], cases[-1])
     either = ca.Function.if_else("either", cases[0], cases[2])
     v = ca.MX.sym("v", 8)
     matrix = ca.reshape(v[2:8], 3, 2).T
-    first, product, _ = several(v[0], v[[3, 1, 2]], v[1], matrix)
+    first, product, _ = switch(v[0], v[[3, 1, 2]], v[1], matrix)
     second, _, number = either(v[1] > 0, first, ca.norm_2(v), ca.DM(np.arange(6.0).reshape(2, 3)))
     output = ca.vertcat(second[::-1], product, number, ca.mmin(v), ca.dot(v, v), v.T @ v)
     function = ca.Function("branches", [v], [ca.densify(output)])
@@ -295,11 +297,11 @@ def test_tables():
     row = ca.DM(table.T) @ (ca.DM(range(40)) == place)
     function = ca.Function("tables", [x], [ca.vertcat(place, row)])
     samples = np.concatenate([table, np.random.default_rng(2).normal(size=(40, 3))])
-    found = agree(function, samples)
+    values = agree(function, samples)
     rows = np.arange(40)
     rows[30] = 7
-    np.testing.assert_array_equal(found[:40, 0], rows)
-    np.testing.assert_array_equal(found[:40, 1:], table)
+    np.testing.assert_array_equal(values[:40, 0], rows)
+    np.testing.assert_array_equal(values[:40, 1:], table)
 
 
 @pytest.mark.parametrize("scale", [1e-9, 0.5, 3.0, 1e9])
@@ -312,19 +314,23 @@ def test_elementary_functions_computed_together(scale):
     function = ca.Function("several", [x], [ca.vertcat(values, later, ca.sin(x[0]) * values)])
     samples = np.random.default_rng(5).normal(size=(500, COUNT)) * scale
     samples[0] = [np.nan, 0.0, -0.0, np.inf, 1.0, -1.0, 6e8]
-    (whole,) = FunctionKernel(function)(samples)
+    (function_values,) = FunctionKernel(function)(samples)
     (beside,) = FunctionKernel(function, in_lanes=True)(samples)
-    np.testing.assert_array_equal(beside, whole)
-    one, other = ca.SX.sym("x"), ca.SX.sym("y")
-    sine = FunctionKernel(ca.Function("one_sine", [one], [ca.sin(one)]))
-    angle = FunctionKernel(ca.Function("one_angle", [one, other], [ca.atan2(one, other)]))
+    np.testing.assert_array_equal(beside, function_values)
+    input_x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    sine = FunctionKernel(ca.Function("one_sine", [input_x], [ca.sin(input_x)]))
+    angle = FunctionKernel(ca.Function("one_angle", [input_x, y], [ca.atan2(input_x, y)]))
     size = values.numel()
-    cosine = FunctionKernel(ca.Function("one_cosine", [one], [ca.cos(one)]))
-    inner = np.ascontiguousarray(whole[:, :size])
+    cosine = FunctionKernel(ca.Function("one_cosine", [input_x], [ca.cos(input_x)]))
+    inner = np.ascontiguousarray(function_values[:, :size])
     np.testing.assert_array_equal(inner[:, :COUNT].ravel(), sine(samples.ravel())[0])
-    np.testing.assert_array_equal(whole[:, size : 2 * size].ravel(), cosine(inner.ravel() + 1)[0])
+    np.testing.assert_array_equal(
+        function_values[:, size : 2 * size].ravel(), cosine(inner.ravel() + 1)[0]
+    )
     rows = [np.ascontiguousarray(block).ravel() for block in (inner[:, 1:], inner[:, :-1])]
-    np.testing.assert_array_equal(whole[:, 2 * size : 3 * size - 1].ravel(), angle(*rows)[0])
+    np.testing.assert_array_equal(
+        function_values[:, 2 * size : 3 * size - 1].ravel(), angle(*rows)[0]
+    )
 
 
 SPECIAL = np.array([0.0, -0.0, 1.0, -1.0, 0.5, -2.5, 1e-310, 1e300, np.inf, -np.inf, np.nan])
@@ -345,15 +351,15 @@ def test_operations_on_special_numbers():
     pairs = np.stack(np.meshgrid(SPECIAL, SPECIAL), axis=-1).reshape(-1, 2)
     function = ca.Function("operations", [v], [ca.vertcat(*values)])
     kernel = FunctionKernel(function)
-    (found,), (expected,) = kernel(pairs), FunctionKernel(function, compiled=False)(pairs)
+    (compiled_values,), (expected,) = kernel(pairs), FunctionKernel(function, compiled=False)(pairs)
     (beside,) = FunctionKernel(function, in_lanes=True)(pairs)
-    np.testing.assert_array_equal(beside, found)
-    same = np.signbit(beside) == np.signbit(found)
-    assert (same | np.isnan(found)).all()
+    np.testing.assert_array_equal(beside, compiled_values)
+    same_sign = np.signbit(beside) == np.signbit(compiled_values)
+    assert (same_sign | np.isnan(compiled_values)).all()
     # Two infinite coordinates have no direction here.
     expected[np.isinf(pairs).all(axis=1), len(values) - len(binary)] = np.nan
-    np.testing.assert_allclose(found, expected, rtol=1e-15, atol=0)
-    assert np.isfinite(found).any(axis=0).all()
+    np.testing.assert_allclose(compiled_values, expected, rtol=1e-15, atol=0)
+    assert np.isfinite(compiled_values).any(axis=0).all()
 
 
 def test_what_has_no_c_code_is_named():
@@ -378,9 +384,9 @@ def sorted_rows(table, keys, count):
         np.rint(x * STEPS_PER_UNIT).clip(-MAX_STEPS, MAX_STEPS)
         for x in (table, np.nan_to_num(keys))
     ]
-    steps, wanted = (x.astype(np.int64) for x in rounded)
-    apart = np.where(np.isnan(keys)[:, None], 0, steps[None] - wanted[:, None])
-    return (apart**2).sum(axis=2).argsort(axis=1, kind="stable")[:, :count]
+    steps, order = (x.astype(np.int64) for x in rounded)
+    rank_distance = np.where(np.isnan(keys)[:, None], 0, steps[None] - order[:, None])
+    return (rank_distance**2).sum(axis=2).argsort(axis=1, kind="stable")[:, :count]
 
 
 @BOTH

@@ -64,16 +64,16 @@ def test_symbols_lie_where_numbers_lie(layout, mixed):
         last = layout.names[-1]
         symbols[last] = values[last]
     packed = ca.Function("packed", arguments, [ca.SX(layout.pack(symbols))])
-    found = packed.call([ca.DM(values[item.name]) for item in layout])[0]
-    np.testing.assert_array_equal(found.full().ravel(), layout.pack(values))
+    packed_numbers = packed.call([ca.DM(values[item.name]) for item in layout])[0]
+    np.testing.assert_array_equal(packed_numbers.full().ravel(), layout.pack(values))
 
 
 @given(layouts())
 def test_symbols_go_round(layout):
     vector = layout.symbols("v")
-    again = layout.pack(layout.unpack(vector))
-    assert again.sparsity().is_dense()
-    assert ca.is_equal(again, vector, 1)
+    vector_again = layout.pack(layout.unpack(vector))
+    assert vector_again.sparsity().is_dense()
+    assert ca.is_equal(vector_again, vector, 1)
 
 
 @given(layouts())
@@ -103,10 +103,10 @@ def test_bad_layouts_and_values_are_named():
 def test_step_whose_sizes_disagree_is_refused():
     x = ca.SX.sym("x", 2)
     function = ca.Function("f", [x, ca.SX.sym("p")], [x, x, 0])
-    two, one = Layout((Field("x", (2,)),)), Layout((Field("p"),))
-    StepGraph("fine", function, two, one, two)
+    two, scalar_layout = Layout((Field("x", (2,)),)), Layout((Field("p"),))
+    StepGraph("fine", function, two, scalar_layout, two)
     with pytest.raises(ik.errors.InputError, match="'wrong'"):
-        StepGraph("wrong", function, two, one, one)
+        StepGraph("wrong", function, two, scalar_layout, scalar_layout)
 
 
 # Double, and what it has to become in u1, u4 and i4.
@@ -167,5 +167,5 @@ def test_loop_conversion(compiled):
     assert rows.dtype.itemsize % 4
     np.testing.assert_array_equal(rows["odd"], [[1, 2]] * 3)
     for name in LAYOUT.names:
-        wanted = np.broadcast_to(expected()[name], rows[name].shape)
-        np.testing.assert_array_equal(rows[name], wanted)
+        expected_rows = np.broadcast_to(expected()[name], rows[name].shape)
+        np.testing.assert_array_equal(rows[name], expected_rows)

@@ -62,21 +62,21 @@ def scaled(factor: float = 2.0, name: str = "scaled") -> ca.Function:
     return ca.Function(name, [x], [factor * x])
 
 
-def kernel(build: Callable[[], ca.Function] = scaled, known: str = "recipe") -> FunctionKernel:
+def kernel(build: Callable[[], ca.Function] = scaled, key: str = "recipe") -> FunctionKernel:
     """A small kernel of a known recipe: it leaves a library and a note."""
-    return FunctionKernel(FunctionGraph("scaled", build, {"x": (1, 1)}, ((1, 1),), known))
+    return FunctionKernel(FunctionGraph("scaled", build, {"x": (1, 1)}, ((1, 1),), key))
 
 
 def works() -> bool:
-    made = kernel()
-    return made.compiled and made(3)[0] == 6
+    built_kernel = kernel()
+    return built_kernel.compiled and built_kernel(3)[0] == 6
 
 
 def never() -> ca.Function:
     raise AssertionError("the graph was built")
 
 
-def kept(directory: Path, suffix: str) -> list[Path]:
+def cached_files(directory: Path, suffix: str) -> list[Path]:
     return sorted(directory.glob(f"*{suffix}"))
 
 
@@ -105,7 +105,7 @@ def script(text: str, **changed: str) -> Iterator[subprocess.Popen[str]]:
 @needs_compiler
 def test_second_use_builds_nothing(directory, monkeypatch):
     assert works()
-    assert len(kept(directory, ".so")) == len(kept(directory, ".key")) == 1
+    assert len(cached_files(directory, ".so")) == len(cached_files(directory, ".key")) == 1
     forbid_builds(monkeypatch)
     assert kernel(never)(3)[0] == 6
     forget(monkeypatch)
@@ -123,25 +123,33 @@ def test_everything_a_library_follows_from_tells_it_apart(directory, monkeypatch
     LoopKernel(counting_step("scaled", offset=1.0))
     monkeypatch.setenv("CASADI_IK_CFLAGS", "-O1")
     assert works()
-    before = len([path for path in kept(directory, ".so") if path.name.startswith("scaled")])
-    assert before == 5
+    count_before = len(
+        [path for path in cached_files(directory, ".so") if path.name.startswith("scaled")]
+    )
+    assert count_before == 5
 
 
 @needs_compiler
 @pytest.mark.parametrize("damage", ["torn", "empty", "foreign", "other library", "gone"])
 def test_broken_library_is_rebuilt(directory, monkeypatch, damage):
     assert works()
-    (path,) = kept(directory, ".so")
-    whole = path.read_bytes()
+    (path,) = cached_files(directory, ".so")
+    data = path.read_bytes()
     # Never written in place: this process has the file mapped.
     path.unlink()
     if damage == "other library":
         # A whole and loadable file under a name that fits its bytes, but of another driver.
         LoopKernel(counting_step("other"))
-        (other,) = [one for one in kept(directory, ".so") if one.name.startswith("other")]
-        other.rename(path.with_name(f"{path.stem.rpartition('-')[0]}-{digest(other)}.so"))
+        (other_library,) = [
+            cached_file
+            for cached_file in cached_files(directory, ".so")
+            if cached_file.name.startswith("other")
+        ]
+        other_library.rename(
+            path.with_name(f"{path.stem.rpartition('-')[0]}-{digest(other_library)}.so")
+        )
     elif damage != "gone":
-        damaged = {"torn": whole[: len(whole) // 2], "empty": b"", "foreign": b"no library"}
+        damaged = {"torn": data[: len(data) // 2], "empty": b"", "foreign": b"no library"}
         path.write_bytes(damaged[damage])
     forget(monkeypatch)
     assert works()
@@ -154,7 +162,7 @@ def test_broken_library_is_rebuilt(directory, monkeypatch, damage):
 @pytest.mark.parametrize("note", ["012345", "0" * 32, "\N{SNOWMAN}"])
 def test_broken_note_is_written_again(directory, monkeypatch, note):
     assert works()
-    kept(directory, ".key")[0].write_text(note, encoding="utf-8")
+    cached_files(directory, ".key")[0].write_text(note, encoding="utf-8")
     forget(monkeypatch)
     assert works()
     forget(monkeypatch)
@@ -162,11 +170,18 @@ def test_broken_note_is_written_again(directory, monkeypatch, note):
 
 
 def test_recipes_differ_where_their_data_do():
-    robot, again = (ik.load_robot("kuka_lwr_barrett").description for _ in range(2))
-    moved, machine = (replace(robot, home=robot.home + by) for by in (1e-9, 1e-16))
-    assert recipe(robot, 8) == recipe(again, 8) == recipe(machine, 8)
-    others = [(robot, 9), (moved, 8), (robot, 8.0), (robot, "8"), (robot, (8,)), (robot, None)]
-    assert len({recipe(*parts) for parts in ((robot, 8), *others)}) == 7
+    robot, same_robot = (ik.load_robot("kuka_lwr_barrett").description for _ in range(2))
+    moved_robot, machine = (replace(robot, home=robot.home + by) for by in (1e-9, 1e-16))
+    assert recipe(robot, 8) == recipe(same_robot, 8) == recipe(machine, 8)
+    distinct_recipes = [
+        (robot, 9),
+        (moved_robot, 8),
+        (robot, 8.0),
+        (robot, "8"),
+        (robot, (8,)),
+        (robot, None),
+    ]
+    assert len({recipe(*parts) for parts in ((robot, 8), *distinct_recipes)}) == 7
 
 
 @needs_compiler
@@ -184,14 +199,14 @@ def test_processes_that_need_the_same_build_it_once(directory):
         sys.stdin.readline()
         print(FunctionKernel(ca.Function("raced", [x], [ca.sin(x) + 2]))(0)[0])
     """
-    with script(text) as one, script(text) as two, script(text) as three:
-        for process in (one, two, three):
+    with script(text) as first, script(text) as two, script(text) as three:
+        for process in (first, two, three):
             assert process.stdin is not None
             process.stdin.write("go\n")
             process.stdin.flush()
-        said = [process.communicate(timeout=300)[0].split() for process in (one, two, three)]
-    assert sorted(said) == [["2.0"], ["2.0"], ["built", "2.0"]]
-    assert sorted(directory.iterdir()) == kept(directory, ".so")
+        outputs = [process.communicate(timeout=300)[0].split() for process in (first, two, three)]
+    assert sorted(outputs) == [["2.0"], ["2.0"], ["built", "2.0"]]
+    assert sorted(directory.iterdir()) == cached_files(directory, ".so")
 
 
 # Kernels made ahead, and what may be built when.
@@ -203,7 +218,7 @@ def test_kernels_made_ahead_serve_without_a_compiler(directory, tmp_path, monkey
     texts: dict[str, str] = {}
     monkeypatch.setattr(libraries, "text_listeners", [texts.__setitem__])
     assert works()
-    (name,), (library,) = texts, kept(directory, ".so")
+    (name,), (library,) = texts, cached_files(directory, ".so")
     files = {
         "__init__.py": b"",
         "made_for": package_sources().encode() if made_for == "these sources" else b"0",
@@ -252,41 +267,41 @@ def test_without_compiler_one_warning(directory, monkeypatch, tmp_path, cc):
         monkeypatch.setenv("PATH", str(tmp_path))
         monkeypatch.setitem(sys.modules, "ziglang", None)
     with pytest.warns(NoCompilerWarning, match="no C compiler") as caught:
-        made = kernel()
+        built_kernel = kernel()
     assert len(caught) == 1
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         loop = LoopKernel(counting_step())
         FunctionKernel(scaled(3))
-    assert not made.compiled
+    assert not built_kernel.compiled
     assert not loop.compiled
-    np.testing.assert_array_equal(made([1, 2])[0], [2, 4])
+    np.testing.assert_array_equal(built_kernel([1, 2])[0], [2, 4])
     assert loop.run([[0]], [4], 9).iterations.tolist() == [4]
     assert not directory.exists()
 
 
 @needs_compiler
 def test_cc_may_have_arguments(directory, monkeypatch):
-    found = compiler.find_compiler()
-    assert found is not None
-    monkeypatch.setenv("CC", f"{found.command[0]} -DSOMETHING=1")
-    again = compiler.find_compiler()
-    assert again is not None
-    assert again.command == (found.command[0], "-DSOMETHING=1")
+    compiler_path = compiler.find_compiler()
+    assert compiler_path is not None
+    monkeypatch.setenv("CC", f"{compiler_path.command[0]} -DSOMETHING=1")
+    compiler_again = compiler.find_compiler()
+    assert compiler_again is not None
+    assert compiler_again.command == (compiler_path.command[0], "-DSOMETHING=1")
     assert works()
 
 
 @pytest.mark.parametrize(
-    ("variable", "value", "said"),
+    ("variable", "value", "expected_words"),
     [
         ("CASADI_IK_CFLAGS", '"x', "CASADI_IK_CFLAGS='\"x': No closing quotation"),
         ("CASADI_IK_LANES", "3", "CASADI_IK_LANES='3': expected 1, 4 or 8"),
         ("CASADI_IK_COMPILE", "later", "CASADI_IK_COMPILE='later': expected background or wait"),
     ],
 )
-def test_malformed_variables(directory, monkeypatch, variable, value, said):
+def test_malformed_variables(directory, monkeypatch, variable, value, expected_words):
     monkeypatch.setenv(variable, value)
-    with pytest.raises(ik.errors.KernelError, match=said):
+    with pytest.raises(ik.errors.KernelError, match=expected_words):
         _ = compiler.find_compiler(), compiler.waits_for_compiler(), LoopKernel(counting_step())
 
 
@@ -294,13 +309,13 @@ def test_malformed_variables(directory, monkeypatch, variable, value, said):
 @pytest.mark.parametrize("name", ["qsort_r", "a" * 5000])
 def test_names_of_functions(directory, name):
     """Of one of the C library, and too long for a file."""
-    made = FunctionKernel(scaled(name=name))
-    assert made.compiled
-    assert made(3)[0] == 6
-    assert not hasattr(ctypes.CDLL(str(kept(directory, ".so")[0])), "casadi_ik_loop")
+    built_kernel = FunctionKernel(scaled(name=name))
+    assert built_kernel.compiled
+    assert built_kernel(3)[0] == 6
+    assert not hasattr(ctypes.CDLL(str(cached_files(directory, ".so")[0])), "casadi_ik_loop")
 
 
-def lie(directory: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+def lie(directory: Path, monkeypatch: pytest.MonkeyPatch, property_name: str) -> None:
     """A compiler in whose hands the library $out has just been made by the real one."""
     real = compiler.find_compiler()
     assert real is not None
@@ -309,7 +324,7 @@ def lie(directory: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
         f'#!/bin/sh\n{real.command[0]} "$@" || exit\n'
         'case "$*" in *--version*) exit;; esac\n'
         'while [ "$1" != -o ]; do shift; done; out=$2\n'
-        f"{what}\n"
+        f"{property_name}\n"
     )
     path.chmod(0o700)
     monkeypatch.setenv("CC", f'"{path}"')
@@ -318,7 +333,7 @@ def lie(directory: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
 @POSIX
 @needs_compiler
 @pytest.mark.parametrize(
-    ("what", "said"),
+    ("property_name", "expected_words"),
     [
         (': > "$out"', "cannot be loaded"),
         ('rm "$out"', "made no library"),
@@ -328,9 +343,9 @@ def lie(directory: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
         ('echo "no such header.h" >&2; exit 1', r"exit code 1.*no such header\.h"),
     ],
 )
-def test_a_compiler_that_lies(directory, monkeypatch, what, said):
-    lie(directory, monkeypatch, what)
-    with pytest.raises(ik.errors.KernelError, match=said) as caught:
+def test_a_compiler_that_lies(directory, monkeypatch, property_name, expected_words):
+    lie(directory, monkeypatch, property_name)
+    with pytest.raises(ik.errors.KernelError, match=expected_words) as caught:
         kernel()
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 1000
@@ -354,13 +369,13 @@ def test_a_long_compilation_is_announced(directory, monkeypatch, terminal, waits
             assert libraries.load_library("named", lambda: padded, "say") is not None
             forget(monkeypatch)
         os.set_blocking(read, False)
-        said = ""
+        output = ""
         with suppress(BlockingIOError):
-            said = os.read(read, 1000).decode()
+            output = os.read(read, 1000).decode()
     os.close(read)
     expected = size > 1000 and (terminal or not waits)
-    about = r"compiling named \(about 5 s, once per machine\)\s*"
-    assert re.fullmatch(about if expected else "", said)
+    announcement = r"compiling named \(about 5 s, once per machine\)\s*"
+    assert re.fullmatch(announcement if expected else "", output)
 
 
 # Whose files are loaded, and places that are no use.
@@ -375,29 +390,29 @@ def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if os.getuid() == 0:
         os.chown(path, SOMEBODY, SOMEBODY)
         return
-    theirs, others = path.lstat().st_ino, cache._others
+    theirs, owner_check = path.lstat().st_ino, cache._others
 
-    def seen(found: os.stat_result, sticky: bool) -> str:
+    def foreign_owner(found: os.stat_result, sticky: bool) -> str:
         if found.st_ino == theirs:
             found = os.stat_result((*found[:4], SOMEBODY, *found[5:10]))
-        return others(found, sticky)
+        return owner_check(found, sticky)
 
-    monkeypatch.setattr(cache, "_others", seen)
+    monkeypatch.setattr(cache, "_others", foreign_owner)
 
 
 def plant(directory: Path) -> Path:
     """Put a library in the place of the kernel's own that leaves a mark where it is loaded."""
-    (library,) = kept(directory, ".so")
+    (library,) = cached_files(directory, ".so")
     source, mark = directory / "evil.c", directory / "mark"
     source.write_text(
         "#include <stdio.h>\n#include <stdint.h>\n"
         f'__attribute__((constructor)) static void run(void) {{ fclose(fopen("{mark}", "w")); }}\n'
         "int casadi_ik_map(void *job) { (void)job; return 0; }\n"
     )
-    found = compiler.find_compiler()
-    assert found is not None
+    compiler_path = compiler.find_compiler()
+    assert compiler_path is not None
     built = directory / "evil.so"
-    subprocess.run([*found.command, "-fPIC", "-shared", "-o", built, source], check=True)
+    subprocess.run([*compiler_path.command, "-fPIC", "-shared", "-o", built, source], check=True)
     library.unlink()
     source.unlink()
     return built.rename(directory / f"{library.stem.rpartition('-')[0]}-{digest(built)}.so")
@@ -430,8 +445,8 @@ def test_planted_libraries_are_not_loaded(directory, monkeypatch, danger):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert (works() and works()) == (danger != "none")
-    said = [CacheWarning] if "folder" in danger or danger == "parent" else []
-    assert [warning.category for warning in caught] == said
+    warnings_expected = [CacheWarning] if "folder" in danger or danger == "parent" else []
+    assert [warning.category for warning in caught] == warnings_expected
     assert (directory / "mark").exists() == (danger == "none")
     assert not any("\n" in str(warning.message) for warning in caught)
 
@@ -441,7 +456,7 @@ def test_planted_libraries_are_not_loaded(directory, monkeypatch, danger):
 @pytest.mark.parametrize("danger", ["theirs", "writable"])
 def test_a_planted_note_is_not_believed(directory, monkeypatch, danger):
     assert works()
-    (note,), (library,) = kept(directory, ".key"), kept(directory, ".so")
+    (note,), (library,) = cached_files(directory, ".key"), cached_files(directory, ".so")
     wrong = "0" * 32
     note.write_text(wrong)
     library.rename(library.with_name(library.name.replace(library.name.split("-")[1], wrong)))
@@ -451,7 +466,7 @@ def test_a_planted_note_is_not_believed(directory, monkeypatch, danger):
         give_away(note, monkeypatch)
     forget(monkeypatch)
     assert works()
-    assert len(kept(directory, ".so")) == 2  # the one of the note was not taken
+    assert len(cached_files(directory, ".so")) == 2  # the one of the note was not taken
 
 
 def test_cache_directory(monkeypatch, tmp_path):
@@ -470,11 +485,11 @@ def test_cache_directory(monkeypatch, tmp_path):
 def test_folders_are_the_users_alone(directory, monkeypatch):
     """Made so, whatever the mask; of one above a sticky one is enough."""
     monkeypatch.setenv("CASADI_IK_CACHE", str(directory / "a"))
-    before = os.umask(0)
+    mask_before = os.umask(0)
     try:
         assert cache.trusted_cache() == Path(os.path.realpath(directory / "a"))
     finally:
-        os.umask(before)
+        os.umask(mask_before)
     assert [place.stat().st_mode & 0o777 for place in (directory, directory / "a")] == [0o700] * 2
     directory.chmod(0o1777)
     assert cache.trusted_cache() is not None
@@ -490,21 +505,21 @@ def test_folders_are_the_users_alone(directory, monkeypatch):
 )
 def test_places_that_are_no_use(tmp_path, directory, monkeypatch, place):
     """One line, and a folder of the user's own among temporary files serves: the next finds it."""
-    wanted = directory
+    expected_folder = directory
     if place == "file in the way":
         directory.write_text("")
-        wanted = directory / "cache"
+        expected_folder = directory / "cache"
     elif place == "too long":
-        wanted = directory / ("x" * 5000)
+        expected_folder = directory / ("x" * 5000)
     elif place == "dead link":
         directory.symlink_to(tmp_path / "nowhere")
     elif place == "no name":
-        wanted = Path("/proc/nothing/here")
+        expected_folder = Path("/proc/nothing/here")
     elif os.getuid() == 0:
         pytest.skip("root may read and write everything")
     else:
         directory.mkdir(mode=0 if place == "unreadable" else 0o500)
-    monkeypatch.setenv("CASADI_IK_CACHE", str(wanted))
+    monkeypatch.setenv("CASADI_IK_CACHE", str(expected_folder))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -535,10 +550,10 @@ def test_a_full_disk(directory, monkeypatch):
     forget(monkeypatch)
     everywhere = True
     with pytest.warns((CacheWarning, NoCompilerWarning)) as caught:
-        made = kernel()
+        built_kernel = kernel()
     assert caught[-1].category is NoCompilerWarning
-    assert not made.compiled
-    assert made(3)[0] == 6
+    assert not built_kernel.compiled
+    assert built_kernel(3)[0] == 6
     assert list(directory.iterdir()) == []
 
 
@@ -566,8 +581,8 @@ def test_a_working_folder_that_is_gone(tmp_path):
         print(kernel.compiled, kernel(3)[0])
     """
     with script(text, CASADI_IK_CACHE="relative") as process:
-        said, complaint = process.communicate(timeout=300)
-    assert said == "True 6.0\n"
+        output, complaint = process.communicate(timeout=300)
+    assert output == "True 6.0\n"
     assert complaint.count("CacheWarning") == 1
 
 
@@ -583,42 +598,44 @@ class Pressed:
 
 
 @needs_compiler
-@pytest.mark.parametrize("when", ["graph", "compiler"])
-def test_ctrl_c_leaves_nothing(directory, monkeypatch, when):
+@pytest.mark.parametrize("moment", ["graph", "compiler"])
+def test_ctrl_c_leaves_nothing(directory, monkeypatch, moment):
     def build() -> ca.Function:
         with suppress(TypeError):
             _ = ca.SX.sym("x") * Pressed()  # type: ignore[operator]
         return scaled()
 
-    if when == "compiler":
+    if moment == "compiler":
         lie(directory, monkeypatch, "kill -INT $PPID; sleep 2")
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's "&" ignores it
+    handler_before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # a shell's "&" ignores it
     try:
         with pytest.raises(KeyboardInterrupt):
-            kernel(build if when == "graph" else scaled)
+            kernel(build if moment == "graph" else scaled)
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler_before)
     assert list(directory.iterdir()) == []
 
 
 @needs_compiler
 def test_what_killed_compilations_left_goes(directory):
     """Of dead processes after an hour, of unknown ones after a day, and nothing else."""
-    gone = subprocess.Popen(["true"])
-    gone.wait()
+    ended_process = subprocess.Popen(["true"])
+    ended_process.wait()
     directory.mkdir(mode=0o700)
-    made = {
-        f"build-{gone.pid}-a": (2, False),
-        f"build-{gone.pid}-b": (0, True),
+    leftovers = {
+        f"build-{ended_process.pid}-a": (2, False),
+        f"build-{ended_process.pid}-b": (0, True),
         f"build-{os.getpid()}-c": (2, True),
         f"build-{os.getpid()}-d": (30, True),
         "build-e_old": (30, False),
         "build-f_young": (2, True),
-        f".x-0.key.{gone.pid}.part": (2, False),
+        f".x-0.key.{ended_process.pid}.part": (2, False),
         f".x-0.key.{os.getpid()}.part": (2, True),
         "mine": (30, True),
     }
-    for name, (hours, _) in made.items():
+    for name, (hours, _) in leftovers.items():
         path = directory / name
         if name.startswith("build"):
             path.mkdir()
@@ -628,7 +645,7 @@ def test_what_killed_compilations_left_goes(directory):
         age(path, 3600 * hours + 60)
     assert works()
     left = {path.name for path in directory.iterdir() if not path.name.startswith("scaled")}
-    assert left == {name for name, (_, stays) in made.items() if stays}
+    assert left == {name for name, (_, stays) in leftovers.items() if stays}
 
 
 def age(path: Path, seconds: float) -> None:

@@ -92,7 +92,7 @@ def test_compiled_step_equals_vm_but_for_the_last_places(step):
 def test_recording_changes_nothing(compiled):
     kernel = LoopKernel(random_step(), compiled=compiled)
     states, parameters = starts(4)
-    kept = states.copy()
+    states_before = states.copy()
     plain = kernel.run(states, parameters, 50)
     traced = kernel.run(states, parameters, 50, trace=True)
     np.testing.assert_array_equal(plain.states, traced.states)
@@ -102,7 +102,7 @@ def test_recording_changes_nothing(compiled):
     assert [len(rows) for rows in traced.trace] == traced.iterations.tolist()
     for rows, state in zip(traced.trace, traced.states, strict=True):
         np.testing.assert_array_equal(rows["x"][-1], state)
-    np.testing.assert_array_equal(states, kept)
+    np.testing.assert_array_equal(states, states_before)
 
 
 @BOTH
@@ -268,12 +268,12 @@ def test_wrong_shapes_are_named():
 def test_threads_share_a_kernel(compiled):
     kernel = LoopKernel(branching_step(), compiled=compiled)
     inputs = [starts(3, seed) for seed in range(24)]
-    alone = [kernel.run(*pair, 100, trace=True) for pair in inputs]
+    sequential = [kernel.run(*pair, 100, trace=True) for pair in inputs]
     with ThreadPoolExecutor(6) as pool:
-        together = list(
+        concurrent = list(
             pool.map(lambda pair: kernel.run(pair[0], pair[1], 100, trace=True), inputs)
         )
-    for a, b in zip(alone, together, strict=True):
+    for a, b in zip(sequential, concurrent, strict=True):
         assert_same(a, b)
 
 
@@ -331,20 +331,22 @@ def assert_as_alone(
     """The result, once it is known to be that of each solve alone."""
     kernel = LoopKernel(step)
     assert kernel.lanes > 1
-    found = kernel.run(states, parameters, budget, trace=True)
-    assert found.rows is not None
-    alone = [
-        kernel.run(state[None], own[None], budget, trace=True)
-        for state, own in zip(states, parameters, strict=True)
+    batch_run = kernel.run(states, parameters, budget, trace=True)
+    assert batch_run.rows is not None
+    single_runs = [
+        kernel.run(state[None], row_parameters[None], budget, trace=True)
+        for state, row_parameters in zip(states, parameters, strict=True)
     ]
-    assert found.states.tobytes() == np.concatenate([each.states for each in alone]).tobytes()
-    assert found.iterations.tolist() == [each.iterations[0] for each in alone]
-    assert found.status.tolist() == [each.status[0] for each in alone]
-    rows = [each.rows for each in alone if each.rows is not None]
-    assert found.rows.tobytes() == b"".join(each.tobytes() for each in rows)
+    assert (
+        batch_run.states.tobytes() == np.concatenate([run.states for run in single_runs]).tobytes()
+    )
+    assert batch_run.iterations.tolist() == [run.iterations[0] for run in single_runs]
+    assert batch_run.status.tolist() == [run.status[0] for run in single_runs]
+    rows = [run.rows for run in single_runs if run.rows is not None]
+    assert batch_run.rows.tobytes() == b"".join(run.tobytes() for run in rows)
     untraced = kernel.run(states, parameters, budget)
-    assert untraced.states.tobytes() == found.states.tobytes()
-    return found
+    assert untraced.states.tobytes() == batch_run.states.tobytes()
+    return batch_run
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -353,9 +355,9 @@ def assert_as_alone(
 def test_as_alone(step, count):
     rng = np.random.default_rng(count)
     states, parameters = rng.normal(size=(count, 4)), rng.normal(size=(count, 2))
-    found = assert_as_alone(step, states, parameters, 300)
+    batch_run = assert_as_alone(step, states, parameters, 300)
     # Not vacuous: solves end at different iterations.
-    assert count < COUNTS[-1] or len(np.unique(found.iterations)) > 2
+    assert count < COUNTS[-1] or len(np.unique(batch_run.iterations)) > 2
 
 
 def staged_step(stages: int) -> StepGraph:
@@ -369,12 +371,12 @@ def staged_step(stages: int) -> StepGraph:
     new = ca.Function.conditional("choose", cases[:-1], cases[-1])(sm, xm, pm)
     # The digits up to the sixth after the point are as good as chance.
     digits = ca.floor(1e6 * ca.fabs(x))
-    drawn = digits - stages * ca.floor(digits / stages)
+    stage_choice = digits - stages * ca.floor(digits / stages)
     after = ca.Function(
         "after",
         [x, stage],
         [
-            ca.if_else(ca.sin(50 * x) > 0.2, drawn, stage),
+            ca.if_else(ca.sin(50 * x) > 0.2, stage_choice, stage),
             ca.if_else(ca.fabs(x) < 0.01, DONE, RUNNING),
         ],
     )
@@ -394,9 +396,9 @@ def staged_step(stages: int) -> StepGraph:
 def test_stages(stages, count):
     rng = np.random.default_rng(count + stages)
     states = np.column_stack([rng.normal(size=count), rng.integers(stages, size=count)])
-    found = assert_as_alone(staged_step(stages), states, rng.normal(size=(count, 1)), 400)
-    assert count < COUNTS[-1] or len(np.unique(found.states[:, 1])) > 1
-    assert count < COUNTS[-1] or len(np.unique(found.iterations)) > 2
+    batch_run = assert_as_alone(staged_step(stages), states, rng.normal(size=(count, 1)), 400)
+    assert count < COUNTS[-1] or len(np.unique(batch_run.states[:, 1])) > 1
+    assert count < COUNTS[-1] or len(np.unique(batch_run.iterations)) > 2
 
 
 @pytest.mark.parametrize("count", COUNTS)
@@ -412,8 +414,8 @@ def test_every_end_beside_every_other(count):
     step = step_of("all_ends", ca.Function("all_ends", [x, p], [new, new, status]), COUNT)
     rng = np.random.default_rng(count)
     parameters = np.column_stack([np.arange(count) % 4, rng.integers(1, 90, size=count)])
-    found = assert_as_alone(step, rng.uniform(1, 2, size=(count, 1)), parameters, 100)
-    assert set(found.status.tolist()) == {DONE, REPEATED, NON_FINITE, RUNNING}
+    batch_run = assert_as_alone(step, rng.uniform(1, 2, size=(count, 1)), parameters, 100)
+    assert set(batch_run.status.tolist()) == {DONE, REPEATED, NON_FINITE, RUNNING}
 
 
 @LANES
@@ -438,8 +440,8 @@ def test_traces_of_other_lengths_than_the_last_one():
         assert ran.rows is not None
         assert ran.rows.base is None
         assert ran.rows["count"].tolist() == [*range(1, ends + 1)] * count
-        room = kernel._first_rows(count) * ran.rows.dtype.itemsize
-        assert len(ran.rows) * ran.rows.dtype.itemsize <= room <= MAX_FIRST_TRACE_BYTES
+        bytes_reserved = kernel._first_rows(count) * ran.rows.dtype.itemsize
+        assert len(ran.rows) * ran.rows.dtype.itemsize <= bytes_reserved <= MAX_FIRST_TRACE_BYTES
 
 
 def test_few_solves_wait_for_no_compiler(monkeypatch, tmp_path, lanes):

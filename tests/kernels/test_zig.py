@@ -20,7 +20,7 @@ NEEDS_ZIG = pytest.mark.skipif(
     importlib.util.find_spec("ziglang") is None, reason="needs the package ziglang"
 )
 
-HERE = Path(__file__).parent
+FOLDER = Path(__file__).parent
 
 OF_THE_COMPILER = (
     "bit_for_bit or last_places or finite or equals_vm or row_major or comes_back or threads "
@@ -63,10 +63,10 @@ def test_the_kernel_tests_pass(environment):
     files = ("test_loop.py", "test_function_kernel.py")
     done = python(
         *("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-n", "0"),
-        *(HERE / name for name in files),
+        *(FOLDER / name for name in files),
         *("-k", f"({OF_THE_COMPILER}) and not False"),
         env=environment,
-        cwd=HERE.parents[1],
+        cwd=FOLDER.parents[1],
         timeout=900,
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-2000:]
@@ -90,17 +90,17 @@ COUNT = 40
 def iterates() -> bytes:
     """Of steps one after the other and side by side."""
     rng = np.random.default_rng(0)
-    found = []
+    counts = []
     for step in (random_step(0), branching_step()):
         kernel = LoopKernel(step)
         states, parameters = rng.normal(size=(COUNT, 4)), rng.normal(size=(COUNT, 2))
-        one = kernel.run(states[:1], parameters[:1], 300, trace=True)
+        single_run = kernel.run(states[:1], parameters[:1], 300, trace=True)
         _ = kernel.lanes
         result = kernel.run(states, parameters, 300, trace=True)
-        assert one.rows is not None
+        assert single_run.rows is not None
         assert result.rows is not None
-        found += [one.rows.tobytes(), result.states.tobytes(), result.rows.tobytes()]
-    return b"".join(found)
+        counts += [single_run.rows.tobytes(), result.states.tobytes(), result.rows.tobytes()]
+    return b"".join(counts)
 
 
 @needs_compiler

@@ -133,9 +133,9 @@ def changed(block: SolveBlock, **fields: object) -> SolveBlock:
     """The block with other fields; those of its batch too."""
     names = {item.name for item in dataclasses.fields(BatchSolution)}
     of_batch = {name: value for name, value in fields.items() if name in names}
-    rest = {name: value for name, value in fields.items() if name not in names}
+    other_fields = {name: value for name, value in fields.items() if name not in names}
     batch = dataclasses.replace(block.batch, **of_batch)  # type: ignore[arg-type]
-    return dataclasses.replace(block, batch=batch, **rest)  # type: ignore[arg-type]
+    return dataclasses.replace(block, batch=batch, **other_fields)  # type: ignore[arg-type]
 
 
 def chunks_of(path: Path) -> list[ChunkIndex]:
@@ -168,13 +168,18 @@ def rewritten(
             entries["crc32"] = f"{zlib.crc32(json.dumps(pairs).encode()):08x}"
             writer.add_metadata(record.name, entries)
         channels: dict[int, int] = {}
-        for form, own, message in reader.iter_messages():
+        for form, channel_schema, message in reader.iter_messages():
             assert form is not None
-            if own.id not in channels:
-                text, about = schema(form.data.decode()), {**own.metadata, **(channel or {})}
+            if channel_schema.id not in channels:
+                text, channel_metadata = (
+                    schema(form.data.decode()),
+                    {**channel_schema.metadata, **(channel or {})},
+                )
                 number = writer.register_schema(form.name, form.encoding, text.encode())
-                channels[own.id] = writer.register_channel(own.topic, "cdr", number, about)
+                channels[channel_schema.id] = writer.register_channel(
+                    channel_schema.topic, "cdr", number, channel_metadata
+                )
             times = message.log_time, message.data, message.publish_time
-            writer.add_message(channels[own.id], *times, message.sequence)
+            writer.add_message(channels[channel_schema.id], *times, message.sequence)
         writer.finish()
     return copy

@@ -51,7 +51,7 @@ with logs.McapRecorder(sys.argv[1], robot_name="made_up") as recorder:
 
 
 @pytest.fixture
-def whole(write: Write, set_chunk_size: Callable[[int], None]) -> Path:
+def whole_log(write: Write, set_chunk_size: Callable[[int], None]) -> Path:
     """A log of several chunks and two methods."""
     set_chunk_size(2**15)
     blocks = [make_block(*[60] * 3, first=3 * i) for i in range(3)]
@@ -59,33 +59,35 @@ def whole(write: Write, set_chunk_size: Callable[[int], None]) -> Path:
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_a_cut_log(whole: Path, seed: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_cut_log(whole_log: Path, seed: int, caplog: pytest.LogCaptureFixture) -> None:
     """Every complete chunk is read, and the log says that it is not whole."""
     rng = np.random.default_rng(seed)
-    chunks = chunks_of(whole)
-    before = logs.open(whole)
-    truth = before.iterations(method="enhanced-dls").rows
-    urdf = before.attachment("robot.urdf")
-    length = int(rng.integers(whole.stat().st_size))
-    with whole.open("r+b") as stream:
+    chunks = chunks_of(whole_log)
+    log_before = logs.open(whole_log)
+    truth = log_before.iterations(method="enhanced-dls").rows
+    urdf = log_before.attachment("robot.urdf")
+    length = int(rng.integers(whole_log.stat().st_size))
+    with whole_log.open("r+b") as stream:
         stream.truncate(length)
-    complete = [one for one in chunks if one.chunk_start_offset + one.chunk_length <= length]
+    complete = [
+        chunk for chunk in chunks if chunk.chunk_start_offset + chunk.chunk_length <= length
+    ]
     if length < chunks[0].chunk_start_offset:
-        with pytest.raises(errors.LogError, match=rf"^{whole}: "):
-            logs.open(whole)
+        with pytest.raises(errors.LogError, match=rf"^{whole_log}: "):
+            logs.open(whole_log)
         return
-    log = logs.open(whole)
+    log = logs.open(whole_log)
     (message,) = caplog.messages
-    assert message.startswith(f"{whole}: log is incomplete; ")
-    assert log.info().unfinished == (whole,)
+    assert message.startswith(f"{whole_log}: log is incomplete; ")
+    assert log.info().unfinished == (whole_log,)
     assert log.info().chunks == len(complete)
     if not complete:
         assert log.methods == ()
         return
     first = log.solves(method="enhanced-dls").solve_id
     assert first.tolist() == list(range(len(first)))
-    found = log.iterations(method="enhanced-dls").rows
-    assert found.tobytes() == truth[: 60 * len(first)].tobytes()
+    rows = log.iterations(method="enhanced-dls").rows
+    assert rows.tobytes() == truth[: 60 * len(first)].tobytes()
     assert log.attachment("robot.urdf") == urdf
 
 
@@ -129,12 +131,12 @@ def read_messages(path: Path) -> list[tuple[str, int, bytes]]:
         summary = reader.get_summary()
         assert summary is not None
         assert summary.statistics is not None
-        found = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
-        assert summary.statistics.message_count == len(found)
+        messages = [(c.topic, m.log_time, m.data) for _, c, m in reader.iter_messages()]
+        assert summary.statistics.message_count == len(messages)
         assert summary.statistics.chunk_count == len(summary.chunk_indexes)
         assert len(list(reader.iter_metadata())) == summary.statistics.metadata_count
         assert len(list(reader.iter_attachments())) == summary.statistics.attachment_count
-    return found
+    return messages
 
 
 def many_chunks(path: Path, compression: CompressionType, whose: str = "casadi_ik") -> None:
@@ -174,9 +176,9 @@ def test_every_chunk_that_was_written_is_kept(tmp_path: Path, compression: Compr
         expected = [message for message in messages if message[1] <= last]
         assert read_messages(path) == expected
         assert (done.changed, done.messages) == (True, len(expected))
-        again = path.read_bytes()
+        data_again = path.read_bytes()
         assert not logs.finish_log(path).changed
-        assert path.read_bytes() == again
+        assert path.read_bytes() == data_again
 
 
 def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
@@ -200,10 +202,10 @@ def test_damage_in_the_middle_is_refused_and_nothing_changed(tmp_path: Path, clo
     data = bytearray(path.read_bytes())
     data[chunk.chunk_start_offset + chunk.chunk_length - 10] ^= 4
     path.write_bytes(data if closed else data[:-50])
-    before = path.read_bytes()
+    data_before = path.read_bytes()
     with pytest.raises(errors.LogError, match=rf"middle:.*{chunk.chunk_start_offset}"):
         logs.finish_log(path)
-    assert path.read_bytes() == before
+    assert path.read_bytes() == data_before
 
 
 def test_what_is_no_log(tmp_path: Path, small: bytes) -> None:
@@ -294,7 +296,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def places(data: bytes, path: Path) -> list[int]:
     """Bytes to flip: first and last of every kind of record, of its head, and some between."""
     path.write_bytes(data)
-    rng, found = np.random.default_rng(4), {0, len(data) - 1}
+    rng, positions = np.random.default_rng(4), {0, len(data) - 1}
     kinds: dict[type, int] = {}
     with path.open("rb") as stream:
         start = stream.seek(len(MCAP0_MAGIC))
@@ -302,10 +304,10 @@ def places(data: bytes, path: Path) -> list[int]:
             end = stream.tell() - len(MCAP0_MAGIC) * isinstance(record, Footer)
             kinds[type(record)] = kinds.get(type(record), 0) + 1
             if kinds[type(record)] <= 2:
-                found |= {start, start + 1, end - 1, *rng.integers(start, end, 4).tolist()}
+                positions |= {start, start + 1, end - 1, *rng.integers(start, end, 4).tolist()}
             start = end
     assert len(kinds) >= 11, "every kind of record but a message outside of chunks"
-    return sorted(found)
+    return sorted(positions)
 
 
 def test_a_flipped_bit_anywhere(small: bytes, tmp_path: Path) -> None:
@@ -322,7 +324,7 @@ def test_a_flipped_bit_anywhere(small: bytes, tmp_path: Path) -> None:
         logs.finish_log(path)
         return said_by(path)
 
-    asked: list[tuple[Callable[[], Any], Any]] = [
+    data_before: list[tuple[Callable[[], Any], Any]] = [
         (lambda: said_by(path), truth),
         (lambda: said_by(logs.merge_logs([path], merged).path), truth),
         (export, 65),
@@ -331,14 +333,14 @@ def test_a_flipped_bit_anywhere(small: bytes, tmp_path: Path) -> None:
     for offset in offsets:
         data = bytearray(small)
         data[offset] ^= 1 << int(rng.integers(8))
-        for ask, expected in asked:
+        for ask, expected in data_before:
             path.write_bytes(data)
             try:
-                found = ask()
+                result = ask()
             except errors.LogError as error:
                 refused += 1
-                found = re.fullmatch(rf"{path}: [^\n]+", str(error)) and expected
-            assert found == expected, offset
+                result = re.fullmatch(rf"{path}: [^\n]+", str(error)) and expected
+            assert result == expected, offset
     assert refused > len(offsets)
 
 
@@ -360,14 +362,14 @@ def ask_everything(path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
         ("export", path, "--what", "events", "--out", path.with_name("a.csv")),
     ):
         exit_code = main(["log", *map(str, words)])
-        said = capsys.readouterr()
+        output_text = capsys.readouterr()
         assert exit_code in (0, 2)
-        for text in (said.out, said.err):
+        for text in (output_text.out, output_text.err):
             assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u202a-\u202e]", text), words
         if exit_code:
-            assert said.err.count("\n") == 1
-            assert len(said.err) < 1000
-            refusals.append(said.err)
+            assert output_text.err.count("\n") == 1
+            assert len(output_text.err) < 1000
+            refusals.append(output_text.err)
     return refusals
 
 
@@ -521,19 +523,21 @@ def with_chunk(folder: Path, chunk: Chunk) -> Path:
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
-@pytest.mark.parametrize("said", [GIGABYTES, 1000])
+@pytest.mark.parametrize("expected_words", [GIGABYTES, 1000])
 def test_a_chunk_that_unpacks_to_too_much_is_refused(
-    tmp_path: Path, compression: str, said: int
+    tmp_path: Path, compression: str, expected_words: int
 ) -> None:
     """Whether it says so or not, and whether the compressed data say so or not."""
     zeros = bytes(2**24)
     packed = {
-        "zstd": lambda: zstandard.ZstdCompressor(write_content_size=said != 1000).compress(zeros),
+        "zstd": lambda: zstandard.ZstdCompressor(
+            write_content_size=expected_words != 1000
+        ).compress(zeros),
         "lz4": lambda: lz4.frame.compress(zeros),
     }[compression]()
     assert len(packed) < len(zeros) // 100
     with pytest.raises(errors.LogError, match=r"the chunk at byte \d+ (holds|cannot be unpacked)"):
-        logs.finish_log(with_chunk(tmp_path, Chunk(compression, packed, 0, 0, 0, said)))
+        logs.finish_log(with_chunk(tmp_path, Chunk(compression, packed, 0, 0, 0, expected_words)))
 
 
 def test_what_does_not_belong_into_a_chunk_is_refused(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def found_in(
     )
 
 
-def where(events: tuple[Event, ...], kind: logs.EventKind) -> list[int]:
+def iterations_of(events: tuple[Event, ...], kind: logs.EventKind) -> list[int]:
     return [event.iteration for event in events if event.kind is kind]
 
 
@@ -169,7 +169,7 @@ def test_limits_without_coordinates_and_the_highest_bits() -> None:
 
 def test_a_stall_ends_with_its_phase() -> None:
     layout, trace = trace_of(cost=np.ones(36), phase=np.arange(36) // 9)
-    assert where(found_in(layout, trace), KIND.STALL) == []
+    assert iterations_of(found_in(layout, trace), KIND.STALL) == []
 
 
 def test_near_singular_on_entry_only() -> None:
@@ -215,7 +215,7 @@ def test_stall_once_per_standstill() -> None:
     cost = np.concatenate([np.linspace(2, 1, 20), np.ones(30), np.linspace(0.9, 0.5, 5)])
     layout, trace = trace_of(cost=cost)
     events = found_in(layout, trace)
-    assert where(events, logs.EventKind.STALL) == [29]
+    assert iterations_of(events, logs.EventKind.STALL) == [29]
     assert events[0].subject == "whole solve"
     assert events[0].value <= events[0].threshold == 1e-4
 
@@ -229,9 +229,9 @@ def test_stall_by_errors_when_one_finger_is_stuck() -> None:
     assert found_in(*trace_of(position_error=moving)) == ()
     stuck = errors.copy()
     stuck[:, 1] = 0.3
-    assert where(found_in(*trace_of(position_error=stuck)), logs.EventKind.STALL) == [10]
+    assert iterations_of(found_in(*trace_of(position_error=stuck)), logs.EventKind.STALL) == [10]
     free = np.stack([np.full(40, 0.3), np.full(40, np.nan)], axis=1)
-    assert where(found_in(*trace_of(position_error=free)), logs.EventKind.STALL) == [10]
+    assert iterations_of(found_in(*trace_of(position_error=free)), logs.EventKind.STALL) == [10]
 
 
 def test_oscillation_names_the_joints() -> None:
@@ -261,8 +261,8 @@ def test_a_standstill_names_the_singularity_and_the_limits_it_is_at() -> None:
         (logs.EventKind.OSCILLATION, "arm[point]", ("a",)),
         (logs.EventKind.STALL, "arm[point]", ("b",)),
     ]
-    far = found_in(layout, trace, labels, {"arm": RecordedJacobian(singular=0.01)})
-    assert {e.jacobian for e in far} == {""}
+    events_at_limits = found_in(layout, trace, labels, {"arm": RecordedJacobian(singular=0.01)})
+    assert {e.jacobian for e in events_at_limits} == {""}
 
 
 def test_windows_are_checked() -> None:
@@ -288,14 +288,14 @@ def test_solves_do_not_see_each_other(seed: int, counts: list[int]) -> None:
         sigma_arm=np.where(rng.random(m) < 0.2, np.nan, 10 ** rng.uniform(-2, 1, m)),
     )
     arm = {"arm": RecordedJacobian(singular=0.1)}
-    together = found_in(layout, trace, None, arm, counts=counts)
+    batch_events = found_in(layout, trace, None, arm, counts=counts)
     ends = np.cumsum(counts)
-    alone = [
+    single_events = [
         Event(**{**vars(event), "solve_id": solve})
         for solve, (end, count) in enumerate(zip(ends, counts, strict=True))
         for event in found_in(layout, trace[end - count : end], None, arm)
     ]
-    assert list(map(repr, together)) == list(map(repr, alone))
+    assert list(map(repr, batch_events)) == list(map(repr, single_events))
 
 
 def test_entries_and_leavings() -> None:
@@ -303,16 +303,16 @@ def test_entries_and_leavings() -> None:
     form = TraceFormat(Layout.record(Field("clearance", (), "f4", "m")))
     rows = np.zeros(9, form.layout.dtype)
     rows["clearance"] = [-0.01, 0.001, 0.003, 0.001, 0.004, 0.002, 0.005, np.nan, 0.002]
-    found = logs.detect_events(form, rows, np.array([6, 3]), logs.EventRules(clearance=0.002))
-    told = [(e["solve_id"], e["iteration"], logs.EventKind(e["kind"]).name) for e in found]
-    assert told == [
+    events = logs.detect_events(form, rows, np.array([6, 3]), logs.EventRules(clearance=0.002))
+    event_rows = [(e["solve_id"], e["iteration"], logs.EventKind(e["kind"]).name) for e in events]
+    assert event_rows == [
         (0, 0, "COLLISION_ENTERED"),
         (0, 2, "COLLISION_LEFT"),
         (0, 3, "COLLISION_ENTERED"),
         (0, 4, "COLLISION_LEFT"),
     ]
-    np.testing.assert_allclose(found["value"], [-0.01, 0.003, 0.001, 0.004], rtol=1e-6)
-    assert (found["threshold"] == 0.002).all()
+    np.testing.assert_allclose(events["value"], [-0.01, 0.003, 0.001, 0.004], rtol=1e-6)
+    assert (events["threshold"] == 0.002).all()
 
 
 def test_a_log_with_a_scene(robot, tmp_path: Path) -> None:
@@ -415,7 +415,7 @@ STEP = 1e-6
 
 def spread(robot: ik.ArmHand, q: np.ndarray, of: str, columns: tuple[int, ...]) -> np.ndarray:
     """Singular values of a Jacobian by central differences, descending."""
-    found = []
+    jacobian_columns = []
     for column in columns:
         ahead, behind = q.copy(), q.copy()
         ahead[column] += STEP
@@ -424,13 +424,13 @@ def spread(robot: ik.ArmHand, q: np.ndarray, of: str, columns: tuple[int, ...]) 
             first, second = (robot.palm(x) for x in (behind, ahead))
             turn = (second[:3, :3] - first[:3, :3]) @ robot.palm(q)[:3, :3].T / (2 * STEP)
             angular = np.array([turn[2, 1], turn[0, 2], turn[1, 0]])
-            moved = (second[:3, 3] - first[:3, 3]) / (2 * STEP * LENGTH)
-            found.append(np.concatenate([moved, angular]))
+            velocity = (second[:3, 3] - first[:3, 3]) / (2 * STEP * LENGTH)
+            jacobian_columns.append(np.concatenate([velocity, angular]))
         else:
             finger = robot.fingers.index(of)
             first, second = (robot.contacts(x)[0][finger] for x in (behind, ahead))
-            found.append((second - first) / (2 * STEP * LENGTH))
-    return np.linalg.svd(np.array(found).T, compute_uv=False)
+            jacobian_columns.append((second - first) / (2 * STEP * LENGTH))
+    return np.linalg.svd(np.array(jacobian_columns).T, compute_uv=False)
 
 
 @pytest.fixture(scope="module")
@@ -456,12 +456,12 @@ def log(request, robot, arms, tmp_path_factory) -> logs.Log:
 def test_each_row_with_a_configuration_has_the_values_it_should(robot, log):
     """Against singular values of central differences, which know nothing of the measure."""
     rows = log.iterations().rows
-    some = rows[:: max(len(rows) // 12, 1)]
+    row_sample = rows[:: max(len(rows) // 12, 1)]
     arm = robot.description.arm_actuators
     fingers = {name: robot.description.finger_actuators(name) for name in robot.fingers}
     unplaced = log.iterations().method == "hand-first"
     assert "sigma_coupling" not in log.iterations().names, "it has no mechanisms"
-    for row in some:
+    for row in row_sample:
         q = row["q"].astype(float)
         hands = [spread(robot, q, name, columns) for name, columns in fingers.items()]
         assert row["sigma_hand"] == pytest.approx(min(s[-1] for s in hands), rel=1e-3, abs=1e-5)
@@ -481,9 +481,9 @@ def test_singular_arms_are_events_in_every_method(robot, log):
     solves = log.solves()
     lowest = solves.rows["lowest_sigma"][:, solves.labels["lowest_sigma"].index("arm")]
     events = [r for r in log.events(event="NEAR_SINGULAR").records() if r["jacobian"] == "arm"]
-    near = set(np.flatnonzero(lowest < SINGULARITY_THRESHOLDS["arm"][0]).tolist())
-    assert {event["solve_id"] for event in events} == near
-    assert near, "the answers are singular: someone has to come there"
+    near_singular = set(np.flatnonzero(lowest < SINGULARITY_THRESHOLDS["arm"][0]).tolist())
+    assert {event["solve_id"] for event in events} == near_singular
+    assert near_singular, "the answers are singular: someone has to come there"
     for event in events:
         assert event["value"] < event["threshold"] == SINGULARITY_THRESHOLDS["arm"][0]
         assert set(event["joint_mask"]) == set(robot.actuators[:7])
@@ -500,7 +500,7 @@ def test_thumb_first_measures_its_closed_chain(robot):
     description = robot.description
     columns = (*description.arm_actuators, *description.finger_actuators("thumb"))
     for row, x in enumerate(q):
-        found, (_, normals) = [], robot.contacts(x)
+        chain_columns, (_, normals) = [], robot.contacts(x)
         normal = normals[0]
         across = np.linalg.svd(normal[None])[2][1:]
         for column in columns:
@@ -508,8 +508,8 @@ def test_thumb_first_measures_its_closed_chain(robot):
             ahead[column] += STEP
             behind[column] -= STEP
             (p1, n1), (p2, n2) = robot.contacts(behind), robot.contacts(ahead)
-            turned = across @ np.cross(normal, (n2[0] - n1[0]) / (2 * STEP))
-            found.append([*(p2[0] - p1[0]) / (2 * STEP * LENGTH), *turned])
-        s = np.linalg.svd(np.array(found).T, compute_uv=False)
+            angular_rate = across @ np.cross(normal, (n2[0] - n1[0]) / (2 * STEP))
+            chain_columns.append([*(p2[0] - p1[0]) / (2 * STEP * LENGTH), *angular_rate])
+        s = np.linalg.svd(np.array(chain_columns).T, compute_uv=False)
         assert values["sigma_closed_chain"][row] == pytest.approx(s[-1], rel=1e-3)
         assert values["condition_closed_chain"][row] == pytest.approx(s[0] / s[-1], rel=1e-3)

@@ -125,8 +125,8 @@ def test_messages_without_chunks_are_read(log: Path, closed: bool, tmp_path: Pat
         copy.write_bytes(copy.read_bytes()[:-30])
     assert rows_of(copy) == expected
     ours, theirs = logs.open(log), logs.open(copy)
-    some = {"method": "enhanced-dls", "solve": 1}
-    assert theirs.iterations(**some).rows.tobytes() == ours.iterations(**some).rows.tobytes()
+    fields = {"method": "enhanced-dls", "solve": 1}
+    assert theirs.iterations(**fields).rows.tobytes() == ours.iterations(**fields).rows.tobytes()
     assert theirs.info().counts == ours.info().counts
     assert theirs.info().chunks == 0
     finished = logs.finish_log(copy)
@@ -169,14 +169,14 @@ def test_a_bag_without_chunks_is_not_a_log(
         writer.finish()
     if not closed:
         path.write_bytes(path.read_bytes()[:-30])
-    before = path.read_bytes()
+    data_before = path.read_bytes()
     with pytest.raises(errors.LogError) as caught:
         logs.open(path)
     assert str(caught.value).startswith(f"{path}: ")
     for words in (("info",), ("solves",)):
         assert main(["log", *words, str(path)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
-    assert path.read_bytes() == before
+    assert path.read_bytes() == data_before
 
 
 def write_bag(path: Path) -> None:

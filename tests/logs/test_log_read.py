@@ -65,8 +65,8 @@ def test_filters_of_iterations_and_events(write: Write) -> None:
     two = log.iterations(fields=["phase", "cost"], solve=3)
     assert two.rows.dtype.names == ("cost", "phase"), "in the order of the log"
     np.testing.assert_array_equal(two.rows["cost"], block.rows["cost"][43:])
-    some = log.iterations(fields=["cost"], phase="refinement")
-    np.testing.assert_array_equal(some.rows["cost"], refined.rows["cost"])
+    selection = log.iterations(fields=["cost"], phase="refinement")
+    np.testing.assert_array_equal(selection.rows["cost"], refined.rows["cost"])
     events = log.events(event="PHASE_CHANGE", solve=[0, 1])
     assert {record["kind"] for record in events.records()} == {"PHASE_CHANGE"}
     assert set(events.solve_id) == {0, 1}
@@ -93,7 +93,7 @@ def test_only_the_chunks_asked_for_are_read(
 
 
 @pytest.mark.parametrize(
-    ("filters", "known"),
+    ("filters", "known_names"),
     [
         ({"method": "ipopt"}, "enhanced-dls"),
         ({"status": "solved"}, "SOLVED"),
@@ -103,7 +103,7 @@ def test_only_the_chunks_asked_for_are_read(
         ({"stauts": "SOLVED"}, "method, solve, status"),
     ],
 )
-def test_unknown_names(write: Write, filters: dict[str, Any], known: str) -> None:
+def test_unknown_names(write: Write, filters: dict[str, Any], known_names: str) -> None:
     """A filter, its value or a field that the log does not have is named beside the known ones."""
     log = logs.open(write(make_block(30)))
     ((name, value),) = filters.items()
@@ -112,7 +112,7 @@ def test_unknown_names(write: Write, filters: dict[str, Any], known: str) -> Non
     for table in (
         (log.iterations,) if name == "fields" else (log.solves, log.iterations, log.events)
     ):
-        with pytest.raises(expected, match=f"'{unknown}'.*{known}"):
+        with pytest.raises(expected, match=f"'{unknown}'.*{known_names}"):
             table(**filters)
 
 
@@ -127,10 +127,10 @@ def test_several_files_are_one_log(write: Write, tmp_path: Path) -> None:
     for log in (logs.open(paths), logs.open(tmp_path / "a"), logs.open(str(tmp_path))):
         assert log.methods == ("enhanced-dls", "hand-first")
         assert ids(log, method="enhanced-dls") == [3, 10, 11, 20]
-        found = log.iterations(method="enhanced-dls")
-        assert found.solve_id.tolist() == [3] * 7 + [10] * 5 + [11] * 6 + [20] * 4
+        iterations = log.iterations(method="enhanced-dls")
+        assert iterations.solve_id.tolist() == [3] * 7 + [10] * 5 + [11] * 6 + [20] * 4
         expected = np.concatenate([blocks[1].rows, blocks[0].rows, blocks[2].rows])
-        assert found.rows.tobytes() == expected.tobytes()
+        assert iterations.rows.tobytes() == expected.tobytes()
         info = log.info()
         assert info.counts["enhanced-dls"]["iteration"] == 22
         assert info.paths == tuple(paths)
@@ -146,9 +146,9 @@ def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None
             ask([first, copy])
         assert str(caught.value).startswith(f"{copy}: solve 1 of enhanced-dls ")
         assert str(first) in str(caught.value)
-    other = write(make_block(6, first=2), name="2.mcap", robot_name="ar10")
+    other_log = write(make_block(6, first=2), name="2.mcap", robot_name="ar10")
     with pytest.raises(errors.LogError, match=r"2\.mcap:.*'ar10'.*'made_up'.*0\.mcap"):
-        logs.open([first, other])
+        logs.open([first, other_log])
     form = dataclasses.replace(FORMAT, labels={**FORMAT.labels, "q": JOINTS[::-1]})
     third = write(make_block(6, first=2, form=form), name="3.mcap")
     with pytest.raises(errors.LogError, match="2 formats of rows"):
@@ -169,28 +169,28 @@ def test_a_policy_keeps_what_it_says(write: Write) -> None:
     rows["sigma_closed_chain"] = 1.0
     rows["sigma_closed_chain"][20 * 6 + 3] = 1e-4  # in solve 6, which is solved
     block = changed(block, rows=rows)
-    whole = logs.open(write(block, name="whole.mcap"))
+    full_log = logs.open(write(block, name="whole.mcap"))
     sample = logs.Keep(failed=False, singular=False, sample=0.25, seed=5)
     log = logs.open(write(block, keep=sample, name="sample.mcap"))
-    kept = np.flatnonzero(log.solves().rows["kept"])
-    assert 60 < len(kept) < 140
-    assert set(log.iterations().solve_id) == set(log.events().solve_id) == set(kept)
-    assert log.iterations().rows.tobytes() == whole.iterations(solve=kept).rows.tobytes()
-    assert log.events().rows.tobytes() == whole.events(solve=kept).rows.tobytes()
+    kept_solves = np.flatnonzero(log.solves().rows["kept"])
+    assert 60 < len(kept_solves) < 140
+    assert set(log.iterations().solve_id) == set(log.events().solve_id) == set(kept_solves)
+    assert log.iterations().rows.tobytes() == full_log.iterations(solve=kept_solves).rows.tobytes()
+    assert log.events().rows.tobytes() == full_log.events(solve=kept_solves).rows.tobytes()
     for name in (name for name in log.solves().names if name != "kept"):
-        np.testing.assert_array_equal(log.solves().rows[name], whole.solves().rows[name])
+        np.testing.assert_array_equal(log.solves().rows[name], full_log.solves().rows[name])
 
     parts = [
         changed(make_block(*[20] * 100, first=i), rows=rows[20 * i : 20 * i + 2000])
         for i in range(0, 400, 100)
     ]
-    again = logs.open(write(*parts, keep=sample, name="parts.mcap"))
-    np.testing.assert_array_equal(np.flatnonzero(again.solves().rows["kept"]), kept)
+    log_in_parts = logs.open(write(*parts, keep=sample, name="parts.mcap"))
+    np.testing.assert_array_equal(np.flatnonzero(log_in_parts.solves().rows["kept"]), kept_solves)
 
     log = logs.open(write(block, keep=logs.Keep(sample=0.0), name="failed.mcap"))
     solved = block.batch.success
     assert set(np.flatnonzero(log.solves().rows["kept"])) == {*np.flatnonzero(~solved), 6}
-    assert whole.solves().rows["kept"].all()
+    assert full_log.solves().rows["kept"].all()
 
 
 def test_frames(write: Write, tmp_path: Path) -> None:
@@ -278,24 +278,24 @@ def test_numbers_go_on_from_shard_to_shard(study: Path) -> None:
     assert log.solves().rows["solve_id"].tolist() == [0, 1, 2, 3, 4, 5]
     assert log.solves().rows["iterations"].tolist() == ALL_COUNTS
     assert [len(log.iterations(solve=i)) for i in range(6)] == ALL_COUNTS
-    own = [logs.open(study / name) for name in NAMES]
-    expected = [rows for each in own for _, rows in rows_by_solve(each)]
+    logs_of_shards = [logs.open(study / name) for name in NAMES]
+    expected = [rows for log_of_shard in logs_of_shards for _, rows in rows_by_solve(log_of_shard)]
     assert [rows for _, rows in rows_by_solve(log)] == expected
     assert set(log.events(solve=4).rows["solve_id"]) <= {4}
     frame = log.solves(solve=[1, 2, 5]).frame()
     assert frame["shard"].to_list() == list(NAMES)
-    assert "shard" not in own[0].solves().frame().columns
+    assert "shard" not in logs_of_shards[0].solves().frame().columns
     assert [record["shard"] for record in log.solves(solve=5).records()] == [NAMES[2]]
 
 
 def test_where_a_solve_comes_from(study: Path, tmp_path: Path) -> None:
     """In the folder as in what was merged from it, and in what was merged from that."""
     merged = logs.merge_logs([study], tmp_path / "all.mcap").path
-    other = make_block(7, method="hand-first")
+    other_block = make_block(7, method="hand-first")
     with logs.McapRecorder(tmp_path / "b.mcap", robot_name="made_up", urdf="<robot/>") as recorder:
-        recorder.record(other)
+        recorder.record(other_block)
     for log in (logs.open(study), logs.open(merged)):
-        for number, (name, own) in enumerate(
+        for number, (name, shard_log) in enumerate(
             [
                 (NAMES[0], 0),
                 (NAMES[0], 1),
@@ -306,7 +306,7 @@ def test_where_a_solve_comes_from(study: Path, tmp_path: Path) -> None:
             ]
         ):
             solve = logs.one_solve(log, number)
-            assert (solve.shard, solve.number, solve.solve_id) == (name, own, number)
+            assert (solve.shard, solve.number, solve.solve_id) == (name, shard_log, number)
             position = 1e-3 if "tight" in name else 5e-3
             assert solve.parameters["tolerance"]["thumb"]["position"] == position
     keeps = logs.open(merged).info().differs["keep"]
@@ -373,10 +373,10 @@ def test_shards_with_channels_in_another_order_are_merged(write: Write, tmp_path
 def test_a_shard_in_which_nothing_is_whole_is_named_and_left_out(
     study: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, head: str
 ) -> None:
-    whole = (study / NAMES[0]).read_bytes()
+    data = (study / NAMES[0]).read_bytes()
     length = {"empty": 0, "magic": 5, "header": 20, "metadata": 100}[head]
     torn = study / "loose" / "cup" / "00002.mcap"
-    torn.write_bytes(whole[:length])
+    torn.write_bytes(data[:length])
     log = logs.open(study)
     assert len(log.solves()) == 6
     assert log.info().left_out == (torn,)
@@ -420,16 +420,16 @@ def test_a_motion_is_read_back_or_refused(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     times, q = 0.1 * np.arange(5), robot.random(rng, 5)
     ik.motion.Motion(robot, times, q, 0 * q, 0 * q).write(path)
-    found = logs.read_motion(path)
-    assert (found.robot, found.actuators) == (robot.name, robot.actuators)
-    np.testing.assert_allclose(found.times, times, atol=1e-9)
-    np.testing.assert_array_equal(found.q, q)
-    np.testing.assert_array_equal(found.ordered(robot.actuators[::-1]), q[:, ::-1])
+    motion = logs.read_motion(path)
+    assert (motion.robot, motion.actuators) == (robot.name, robot.actuators)
+    np.testing.assert_allclose(motion.times, times, atol=1e-9)
+    np.testing.assert_array_equal(motion.q, q)
+    np.testing.assert_array_equal(motion.ordered(robot.actuators[::-1]), q[:, ::-1])
     with pytest.raises(errors.LogError, match="lwr_joint_1, "):
-        found.ordered(("elbow",))
-    whole, refused = path.read_bytes(), 0
+        motion.ordered(("elbow",))
+    stored_bytes, refused = path.read_bytes(), 0
     for i in range(100):
-        data = bytearray(whole[: rng.integers(len(whole)) if i % 2 else None])
+        data = bytearray(stored_bytes[: rng.integers(len(stored_bytes)) if i % 2 else None])
         data[rng.integers(len(data))] ^= 1 << rng.integers(8)
         path.write_bytes(data)
         try:
@@ -443,30 +443,36 @@ def test_a_motion_is_read_back_or_refused(tmp_path: Path) -> None:
         logs.read_motion(solved)
 
 
-def one(number: int) -> SolveBlock:
+def block_of(number: int) -> SolveBlock:
     """A block of one solve of 50 iterations."""
     return make_block(50, first=number)
 
 
 def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> None:
-    first = write(one(0), name="first.mcap", urdf="<robot/>")
+    first = write(block_of(0), name="first.mcap", urdf="<robot/>")
     layout = Layout.record(Field("q", (3,)), Field("phase", dtype="u1"))
-    other = TraceFormat(layout, LABELS)
+    other_format = TraceFormat(layout, LABELS)
     clock = logs.LogClock(T0 + 10**9)
     cases = {
-        f"t0_ns: found {T0 + 10**9}, expected {T0}": write(one(1), name="late.mcap", clock=clock),
-        "robot: found ar10, expected made_up": write(one(1), name="robot.mcap", robot_name="ar10"),
-        "seed: found 5, expected 0": write(one(1), name="seed.mcap", seed=5),
-        "method 'enhanced-dls' has other fields or names than in": write(
-            make_block(50, first=1, form=other), name="layout.mcap", urdf="<robot/>"
+        f"t0_ns: found {T0 + 10**9}, expected {T0}": write(
+            block_of(1), name="late.mcap", clock=clock
         ),
-        "the attachment 'robot.urdf' differs": write(one(1), name="urdf.mcap", urdf="<other/>"),
+        "robot: found ar10, expected made_up": write(
+            block_of(1), name="robot.mcap", robot_name="ar10"
+        ),
+        "seed: found 5, expected 0": write(block_of(1), name="seed.mcap", seed=5),
+        "method 'enhanced-dls' has other fields or names than in": write(
+            make_block(50, first=1, form=other_format), name="layout.mcap", urdf="<robot/>"
+        ),
+        "the attachment 'robot.urdf' differs": write(
+            block_of(1), name="urdf.mcap", urdf="<other/>"
+        ),
     }
-    before = sorted(tmp_path.iterdir())
+    files_before = sorted(tmp_path.iterdir())
     for reason, shard in cases.items():
         with pytest.raises(errors.LogError) as caught:
             logs.merge_logs([first, shard], tmp_path / "all.mcap")
         assert reason in str(caught.value)
         assert str(shard) in str(caught.value)
         assert str(first) in str(caught.value)
-    assert sorted(tmp_path.iterdir()) == before
+    assert sorted(tmp_path.iterdir()) == files_before

@@ -42,11 +42,11 @@ CDR_HEADER = b"\0\1\0\0"
 def assert_row(message: object, row: np.void) -> None:
     """Every number of a decoded ROS message is that of the row, NaN included."""
     for name in row.dtype.names or ():
-        found = getattr(message, name)
-        if isinstance(found, bytes):
-            found = np.frombuffer(found, np.uint8)
-        found = np.asarray(found).astype(row[name].dtype).reshape(row[name].shape)
-        np.testing.assert_array_equal(found, row[name], err_msg=name)
+        logged = getattr(message, name)
+        if isinstance(logged, bytes):
+            logged = np.frombuffer(logged, np.uint8)
+        logged = np.asarray(logged).astype(row[name].dtype).reshape(row[name].shape)
+        np.testing.assert_array_equal(logged, row[name], err_msg=name)
 
 
 def assert_solves(table: logs.Table, block: SolveBlock) -> None:
@@ -71,17 +71,19 @@ def assert_solves(table: logs.Table, block: SolveBlock) -> None:
 def test_own_reader_gives_the_same_bits(write: Write, compression: str) -> None:
     blocks = [make_block(50, 1, 7), make_block(400, first=7)]
     log = logs.open(write(*blocks, compression=compression))
-    found = log.iterations()
-    assert found.method == "enhanced-dls"
-    assert found.rows.dtype == LAYOUT.dtype
-    assert found.rows.tobytes() == b"".join(block.rows.tobytes() for block in blocks)
-    assert found.labels == LABELS
-    assert found.part.units == {item.name: item.unit for item in LAYOUT}
+    iterations = log.iterations()
+    assert iterations.method == "enhanced-dls"
+    assert iterations.rows.dtype == LAYOUT.dtype
+    assert iterations.rows.tobytes() == b"".join(block.rows.tobytes() for block in blocks)
+    assert iterations.labels == LABELS
+    assert iterations.part.units == {item.name: item.unit for item in LAYOUT}
     counts = [50, 1, 7, 400]
-    np.testing.assert_array_equal(found.solve_id, np.repeat([0, 1, 2, 7], counts))
-    np.testing.assert_array_equal(found.iteration, np.concatenate([np.arange(c) for c in counts]))
-    one = log.iterations(solve=2)
-    assert one.rows.tobytes() == blocks[0].rows[51:].tobytes()
+    np.testing.assert_array_equal(iterations.solve_id, np.repeat([0, 1, 2, 7], counts))
+    np.testing.assert_array_equal(
+        iterations.iteration, np.concatenate([np.arange(c) for c in counts])
+    )
+    rows_of_solve = log.iterations(solve=2)
+    assert rows_of_solve.rows.tobytes() == blocks[0].rows[51:].tobytes()
     assert len(log.iterations(solve=3)) == 0
     assert_solves(log.solves(solve=[0, 1, 2]), blocks[0])
     assert_solves(log.solves(solve=7), blocks[1])
@@ -160,32 +162,32 @@ def test_mcap_and_mcap_ros2_and_rosbags(write: Write, compression: str) -> None:
         messages = [m.ros_msg for m in read_ros2_messages(path, [f"/ik/enhanced-dls/{kind}"])]
         for message, row in zip(messages, rows[kind], strict=True):
             assert_row(message, row)
-    seen = dict.fromkeys(KINDS, 0)
+    counts = dict.fromkeys(KINDS, 0)
     with AnyReader([path]) as reader:
         for connection, _, raw in reader.messages():
             _, _, method, kind = connection.topic.split("/")
             if method == "enhanced-dls":
-                assert_row(reader.deserialize(raw, connection.msgtype), rows[kind][seen[kind]])
-                seen[kind] += 1
+                assert_row(reader.deserialize(raw, connection.msgtype), rows[kind][counts[kind]])
+                counts[kind] += 1
         types = reader.typestore.types
         for kind, constant, code in (
             *(("Iteration", "PHASE_HAND_ALIGNMENT", 1), ("Event", "KIND_OSCILLATION", 9)),
             ("Solve", "STATUS_STALLED", 2),
         ):
             assert getattr(types[f"casadi_ik/msg/{kind}EnhancedDlsQ14F3J1"], constant) == code
-    assert seen == {kind: len(found) for kind, found in rows.items()}
-    assert min(seen.values()) > 0
+    assert counts == {kind: len(kind_rows) for kind, kind_rows in rows.items()}
+    assert min(counts.values()) > 0
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
-        found = list(reader.iter_messages(topics="/ik/enhanced-dls/iteration"))[:50]
-    for i, (form, channel, message) in enumerate(found):
+        kind_rows = list(reader.iter_messages(topics="/ik/enhanced-dls/iteration"))[:50]
+    for i, (form, channel, message) in enumerate(kind_rows):
         assert form is not None
         assert (form.encoding, channel.message_encoding) == ("ros2msg", "cdr")
         assert channel.metadata["offered_qos_profiles"] == ""
         assert message.log_time == T0 + 2 * logs.LogClock(T0).slot + i * 1_000_000
         assert message.sequence == i
-    first, last = found[0][2].publish_time, found[-1][2].publish_time
+    first, last = kind_rows[0][2].publish_time, kind_rows[-1][2].publish_time
     assert block.started[0] < first < last == block.started[0] + 250_000_000
 
 
@@ -318,26 +320,26 @@ def test_a_solve_is_repeated_from_its_log(tmp_path: Path, limits: str) -> None:
     assert target.start is not None
     np.testing.assert_array_equal(target.start[free], q0[free])
     assert target.tolerances == (ik.Tolerance(1e-5, 0.2), *(ik.Tolerance(1e-3, 0.01),) * 2)
-    again = repeated(solve)
-    assert (again.status, again.iterations, again.restarts) == (
+    repeated_solution = repeated(solve)
+    assert (repeated_solution.status, repeated_solution.iterations, repeated_solution.restarts) == (
         *(first.status, first.iterations, first.restarts),
     )
     # A unit normal that is normalised again may change in its last bit.
-    np.testing.assert_allclose(again.q, first.q, rtol=0, atol=1e-9)
-    other = ik.Solver(robot, limits=limits).solve(GRASP)
-    assert not np.allclose(other.q, first.q, atol=1e-3)
+    np.testing.assert_allclose(repeated_solution.q, first.q, rtol=0, atol=1e-9)
+    limited_solution = ik.Solver(robot, limits=limits).solve(GRASP)
+    assert not np.allclose(limited_solution.q, first.q, atol=1e-3)
 
 
 def test_held_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
     block = make_block(3)
-    held = np.full(40, np.nan)
-    held[[1, 33]] = 0.5, -0.25
+    fixed = np.full(40, np.nan)
+    fixed[[1, 33]] = 0.5, -0.25
     points, normals = block.targets.points, block.targets.normals
     wide = changed(
         block,
         q=np.zeros((1, 40)),
         starts=np.ones((1, 40)),
-        targets=TargetBatch(points, normals, ik.Tolerance(), enforce_limits=False, fixed=held),
+        targets=TargetBatch(points, normals, ik.Tolerance(), enforce_limits=False, fixed=fixed),
     )
     log = logs.open(write(wide))
     assert log.solves().rows["fixed_mask"].shape == (1, 2)

@@ -85,8 +85,8 @@ def test_urdf_and_joint_states_give_the_same_frames(decoded: Decoded) -> None:
 def test_iterations_are_those_of_the_log(decoded: Decoded, solve: logs.SolveRecord) -> None:
     messages = [message for _, message in decoded.topics["/ik/iteration"]]
     for name in ("q", "position_error", "sigma_thumb", "phase"):
-        found = np.array([getattr(message, name) for message in messages])
-        np.testing.assert_array_equal(found, solve.rows[name])
+        values = np.array([getattr(message, name) for message in messages])
+        np.testing.assert_array_equal(values, solve.rows[name])
 
 
 def test_contacts_turn_green_when_they_are_reached(
@@ -96,10 +96,10 @@ def test_contacts_turn_green_when_they_are_reached(
         return [entity.arrows[0].color.g > 0.5 for entity in message.entities]
 
     contacts = [green(message) for _, message in decoded.topics["/ik/contacts"]]
-    reached = (solve.rows["position_error"] <= solve.position_tolerance) & (
+    is_reached = (solve.rows["position_error"] <= solve.position_tolerance) & (
         solve.rows["angle_error"] <= solve.angle_tolerance
     )
-    np.testing.assert_array_equal(contacts, reached)
+    np.testing.assert_array_equal(contacts, is_reached)
     assert contacts[-1] == [True, True, True]
     assert contacts[0] == [False, False, False]
     targets = decoded.last("/ik/targets").entities
@@ -144,9 +144,12 @@ def test_another_robot_is_refused(robot: ik.ArmHand) -> None:
     logs.solve.check_robot(robot, urdf, "cup.mcap")
     number = next(word for word in re.findall(r"\d+\.\d{6,}", urdf))
     logs.solve.check_robot(robot, urdf.replace(number, f"{float(number) + 1e-13}"), "cup.mcap")
-    for other in (urdf.replace(number, f"{float(number) + 1e-3}"), urdf.replace("bh_", "hand_")):
+    for changed_urdf in (
+        urdf.replace(number, f"{float(number) + 1e-3}"),
+        urdf.replace("bh_", "hand_"),
+    ):
         with pytest.raises(errors.LogError, match=r"cup\.mcap: robot 'kuka_lwr_barrett'"):
-            logs.solve.check_robot(robot, other, "cup.mcap")
+            logs.solve.check_robot(robot, changed_urdf, "cup.mcap")
 
 
 def test_nothing_to_show_and_nowhere_to_write(

@@ -43,12 +43,12 @@ def test_a_finger_that_was_there_and_left() -> None:
     rows = make_rows()
     rows["position_error"], rows["angle_error"] = 0.001, 0.0
     rows["angle_error"][31:, 0] = 10 * DEGREE
-    found = logs.explain(make_one(rows))
-    (line,) = found.fingers
+    explanation = logs.explain(make_one(rows))
+    (line,) = explanation.fingers
     assert line.startswith("thumb ")
     assert values(line) == [1.0, 10.0, 31, 31]
-    assert found.verdict[0].startswith("thumb ")
-    assert values(found.verdict[0]) == [10.0]
+    assert explanation.verdict[0].startswith("thumb ")
+    assert values(explanation.verdict[0]) == [10.0]
 
 
 def test_who_came_last_when_it_is_solved() -> None:
@@ -56,12 +56,12 @@ def test_who_came_last_when_it_is_solved() -> None:
     rows["position_error"], rows["angle_error"] = 0.001, 0.0
     rows["position_error"][:22, 0] = 0.05
     rows["position_error"][:34, 1] = 0.05
-    found = logs.explain(make_one(rows, restarts=2))
-    assert values(found.headline) == [8, 40, 2]
-    (line,) = found.fingers
+    explanation = logs.explain(make_one(rows, restarts=2))
+    assert values(explanation.headline) == [8, 40, 2]
+    (line,) = explanation.fingers
     assert line.startswith("finger_2 ")
     assert values(line) == [35, 23]
-    assert len(found.verdict) == 2
+    assert len(explanation.verdict) == 2
     rows["position_error"][:34, 0] = 0.05
     (line,) = logs.explain(make_one(rows)).fingers
     assert values(line) == [35]
@@ -78,8 +78,8 @@ def test_a_budget_that_ran_out(end: float, expected: list[float]) -> None:
     rows = make_rows()
     rows["angle_error"] = 0.0
     rows["position_error"][-4:] = np.linspace(0.1, end, 5)[1:, None]
-    found = logs.explain(make_one(rows, status="ITERATION_LIMIT"))
-    assert values(found.verdict[-1]) == expected
+    explanation = logs.explain(make_one(rows, status="ITERATION_LIMIT"))
+    assert values(explanation.verdict[-1]) == expected
 
 
 def test_restless_joints_and_oscillations() -> None:
@@ -87,13 +87,13 @@ def test_restless_joints_and_oscillations() -> None:
     events += [event(3, "LIMIT_HIT", 1.0, joints=("joint_a",))]
     events += [event(i, "OSCILLATION", 0.1, joints=("joint_a", "joint_c")) for i in (11, 22)]
     events += [event(12, "OSCILLATION", 0.1, joints=("joint_c",))]
-    found = logs.explain(
+    explanation = logs.explain(
         make_one(make_rows(), events=tuple(sorted(events, key=lambda e: e.iteration)))
     )
-    assert [values(line) for line in found.incidents] == [[0.5], [5], [12, 3]]
-    assert "joint_c" in found.incidents[1]
-    assert "joint_a" not in found.incidents[1]
-    assert found.incidents[2].startswith("joint_c, joint_a ")
+    assert [values(line) for line in explanation.incidents] == [[0.5], [5], [12, 3]]
+    assert "joint_c" in explanation.incidents[1]
+    assert "joint_a" not in explanation.incidents[1]
+    assert explanation.incidents[2].startswith("joint_c, joint_a ")
 
 
 def test_phases_that_come_again_are_told_one_by_one_or_together() -> None:
@@ -122,24 +122,34 @@ def test_free_fingers_and_unmeasured_rows() -> None:
     rows["position_error"][-1] = rows["angle_error"][-1] = np.nan
     nan = np.array([0.001, np.nan]), np.array([0.0, np.nan])
     solve = make_one(rows, position_error=nan[0], angle_error=nan[1])
-    found = logs.explain(solve)
-    assert [values(line) for line in found.phases] == [[1, 20], [21, 40, 100.0, 11.5, 1.0, 0.0]]
-    assert found.fingers[0].startswith("thumb ")
+    explanation = logs.explain(solve)
+    assert [values(line) for line in explanation.phases] == [
+        [1, 20],
+        [21, 40, 100.0, 11.5, 1.0, 0.0],
+    ]
+    assert explanation.fingers[0].startswith("thumb ")
 
 
 def test_a_free_finger_whose_errors_are_logged_as_zero_is_not_told() -> None:
     rows = make_rows()
     rows["position_error"][:, 1] = rows["angle_error"][:, 1] = 0.0
     free = np.array([0.1, np.nan])
-    found = logs.explain(make_one(rows, position_error=free, angle_error=free))
-    assert "finger_2" not in " ".join((*found.phases, *found.fingers, *found.verdict))
+    explanation = logs.explain(make_one(rows, position_error=free, angle_error=free))
+    assert "finger_2" not in " ".join(
+        (*explanation.phases, *explanation.fingers, *explanation.verdict)
+    )
 
 
 def test_without_a_trace_only_the_end_is_told() -> None:
     solve = make_one(make_rows())
-    found = logs.explain(dataclasses.replace(solve, rows=solve.rows[:0]))
-    assert [values(line) for line in found.verdict] == [[], [100.0, 11.46], [100.0, 11.46], []]
-    assert [line.split()[0] for line in found.verdict[1:3]] == ["thumb", "finger_2"]
+    explanation = logs.explain(dataclasses.replace(solve, rows=solve.rows[:0]))
+    assert [values(line) for line in explanation.verdict] == [
+        [],
+        [100.0, 11.46],
+        [100.0, 11.46],
+        [],
+    ]
+    assert [line.split()[0] for line in explanation.verdict[1:3]] == ["thumb", "finger_2"]
 
 
 def test_without_limits_phases_or_singular_values() -> None:
@@ -147,9 +157,9 @@ def test_without_limits_phases_or_singular_values() -> None:
     lean = Layout.record(*(f for f in LAYOUT if f.name in ("q", "position_error", "angle_error")))
     rows = np.zeros(3, lean.dtype)
     rows["position_error"] = 0.1
-    found = logs.explain(make_one(rows, layout=lean))
-    assert values(found.phases[0])[:3] == [1, 3, 100.0]
-    assert [values(line) for line in found.incidents] == [[]]
+    explanation = logs.explain(make_one(rows, layout=lean))
+    assert values(explanation.phases[0])[:3] == [1, 3, 100.0]
+    assert [values(line) for line in explanation.incidents] == [[]]
 
 
 @pytest.mark.parametrize(
@@ -201,9 +211,9 @@ def test_two_methods_side_by_side() -> None:
     assert values(lines["smallest error"][1]) == [20, 1]
     assert lines["smallest sigma, closed chain"] == ("0.03 in iteration 8", "0.5 in iteration 1")
     assert lines["limits at the end"] == ("none", "none")
-    other = make_one(make_rows(), target_points=np.ones((2, 3)))
+    other_solve = make_one(make_rows(), target_points=np.ones((2, 3)))
     with pytest.raises(errors.InputError, match=r"8.*enhanced-dls"):
-        logs.compare_solves(solved, other)
+        logs.compare_solves(solved, other_solve)
 
 
 def test_targets_are_the_same_but_for_rounding() -> None:
@@ -236,10 +246,10 @@ def failed(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> list[
     )
     batch = solver.solve_batch(*robot.contacts(q), log=path)
     log = logs.open(path)
-    found = [logs.one_solve(log, int(i)) for i in np.flatnonzero(~batch.success)]
-    assert len(found) > 4
-    assert any(e.kind == "NEAR_SINGULAR" for each in found for e in each.events)
-    return found
+    solves = [logs.one_solve(log, int(i)) for i in np.flatnonzero(~batch.success)]
+    assert len(solves) > 4
+    assert any(e.kind == "NEAR_SINGULAR" for solve in solves for e in solve.events)
+    return solves
 
 
 def test_the_fingers_that_are_named_are_those_out_of_tolerance(

@@ -20,10 +20,10 @@ from casadi_ik import errors, logs
 Write = Callable[..., Path]
 
 
-def full_disk(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+def full_disk(monkeypatch: pytest.MonkeyPatch, capacity: int) -> None:
     """From now on a disk has room for so many bytes; what fits is written, as a disk does it."""
     write = os.write
-    left = [room]
+    left = [capacity]
 
     def limited(descriptor: int, data: Any) -> int:
         if left[0] == 0:
@@ -43,18 +43,21 @@ def record_many(path: Path, blocks: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("room", "solves"), [(0, 0), (100, 0), (20_000, 0), (3_000_000, 6), (7_300_000, 18), (-100, 24)]
+    ("capacity", "solves"),
+    [(0, 0), (100, 0), (20_000, 0), (3_000_000, 6), (7_300_000, 18), (-100, 24)],
 )
-def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, solves: int) -> None:
+def test_disk_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capacity: int, solves: int
+) -> None:
     """Nothing remains of a first chunk that does not fit; every other complete chunk is read.
 
     A negative room is short of the whole log by so many bytes, which the summary lacks.
     """
     path = tmp_path / "cup.mcap"
-    if room < 0:
+    if capacity < 0:
         record_many(tmp_path / "whole.mcap", 4)
-        room += (tmp_path / "whole.mcap").stat().st_size
-    full_disk(monkeypatch, room)
+        capacity += (tmp_path / "whole.mcap").stat().st_size
+    full_disk(monkeypatch, capacity)
     with pytest.raises(errors.LogError, match=r"cup\.mcap: .*No space left") as caught:
         record_many(path, 4)
     assert isinstance(caught.value.__cause__, OSError)
@@ -64,8 +67,8 @@ def test_disk_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, s
     log = logs.open(path)
     assert log.info().unfinished == (path,)
     assert len(log.solves()) >= solves
-    found = log.iterations(solve=0)
-    assert found.rows.tobytes() == make_block(1000).rows.tobytes()
+    rows = log.iterations(solve=0)
+    assert rows.rows.tobytes() == make_block(1000).rows.tobytes()
 
 
 @POSIX
@@ -113,10 +116,10 @@ def test_two_writers_on_one_path(tmp_path: Path) -> None:
     with logs.McapRecorder(path, robot_name="made_up") as recorder:
         with pytest.raises(errors.LogError, match=r"cup\.mcap:.*log:"):
             logs.McapRecorder(path, robot_name="made_up")
-        other = subprocess.run(
+        second_writer = subprocess.run(
             [sys.executable, "-c", program, path], capture_output=True, text=True, check=True
         )
-        assert "another writer" in other.stdout
+        assert "another writer" in second_writer.stdout
         recorder.record(make_block(10))
     assert len(logs.open(path).solves()) == 1
     with logs.McapRecorder(path, robot_name="made_up"):
@@ -183,14 +186,14 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
 def test_blocks_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
     path = tmp_path / "cup.mcap"
     good = make_block(5, 5)
-    other = TraceFormat(Layout.record(Field("q", (3,))), LABELS)
+    other_format = TraceFormat(Layout.record(Field("q", (3,))), LABELS)
     bad = {
         "solve 1 is already in the log": make_block(5, 5, first=1),
-        "rows do not have the layout": changed(make_block(3, first=8), format=other),
+        "rows do not have the layout": changed(make_block(3, first=8), format=other_format),
         r"found rows of shape \(3,\), expected \(4,\)": changed(
             make_block(3, first=8), iterations=np.array([4])
         ),
-        "layout or labels differ": make_block(1, first=2, form=other),
+        "layout or labels differ": make_block(1, first=2, form=other_format),
         "lower_snake_case": make_block(
             1, method="new", form=TraceFormat(Layout.record(Field("J")))
         ),
@@ -252,10 +255,14 @@ def test_metadata_is_complete(write: Write) -> None:
     assert metadata["machine"]["cores"] == os.cpu_count()
     assert metadata["code_version"] != "not installed"
     assert {"created", "python", "compression"} <= set(metadata)
-    found = metadata["parameters"]
-    assert found["limits"] == [1.0, "inf"]
-    assert (found["damping"], found["nested"], found["path"]) == (0.1, {"a": [1, None, True]}, "x")
-    assert found["event_rules"]["singular"] == {"arm": 0.02}
+    logged_parameters = metadata["parameters"]
+    assert logged_parameters["limits"] == [1.0, "inf"]
+    assert (
+        logged_parameters["damping"],
+        logged_parameters["nested"],
+        logged_parameters["path"],
+    ) == (0.1, {"a": [1, None, True]}, "x")
+    assert logged_parameters["event_rules"]["singular"] == {"arm": 0.02}
     assert info.attachments == {"robot.urdf": len("<robot name='é'/>".encode())}
     assert log.attachment("robot.urdf").decode() == "<robot name='é'/>"
     with pytest.raises(errors.UnknownNameError, match=r"'x'; attached:"):
@@ -303,28 +310,28 @@ def test_a_solve_that_is_too_large_leaves_the_log_usable(tmp_path: Path) -> None
 @pytest.mark.usefixtures("small_limit")
 def test_the_largest_solve_that_is_written_is_read(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
-    most = 0
+    largest = 0
     for iterations in range(4000, 9000, 250):
         try:
             with logs.McapRecorder(path, robot_name="made_up", compression="lz4") as recorder:
                 recorder.record(make_block(200, iterations))
         except errors.LogError:
-            assert most
+            assert largest
             return
-        most = len(logs.open(path).iterations())
-        assert most == 200 + iterations
+        largest = len(logs.open(path).iterations())
+        assert largest == 200 + iterations
     pytest.fail("nothing was too large")
 
 
 @pytest.mark.usefixtures("small_limit")
 @pytest.mark.parametrize(
-    ("given", "says"),
+    ("fields", "says"),
     [
         ({"urdf": " " * LIMIT}, "attachment 'robot.urdf'"),
         ({"parameters": {"note": "x" * LIMIT}}, "the metadata"),
     ],
 )
-def test_what_goes_with_a_log_is_too_large(tmp_path: Path, given: dict, says: str) -> None:
+def test_what_goes_with_a_log_is_too_large(tmp_path: Path, fields: dict, says: str) -> None:
     with pytest.raises(errors.LogError, match=rf"x\.mcap: {says}.*\d+.*6291456"):
-        logs.McapRecorder(tmp_path / "x.mcap", robot_name="made_up", **given)
+        logs.McapRecorder(tmp_path / "x.mcap", robot_name="made_up", **fields)
     assert list(tmp_path.iterdir()) == []

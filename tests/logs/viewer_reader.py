@@ -47,10 +47,10 @@ class Decoded:
 
 def matrix(position: Any, q: Any) -> np.ndarray:
     """(4, 4) pose of a message's position and orientation."""
-    found = np.eye(4)
-    found[:3, :3] = pinocchio.Quaternion(q.w, q.x, q.y, q.z).matrix()
-    found[:3, 3] = position.x, position.y, position.z
-    return found
+    pose = np.eye(4)
+    pose[:3, :3] = pinocchio.Quaternion(q.w, q.x, q.y, q.z).matrix()
+    pose[:3, 3] = position.x, position.y, position.z
+    return pose
 
 
 def decode(path: Path) -> Decoded:

@@ -23,11 +23,11 @@ def page(tmp_path_factory):
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    before = dict(registry._ENTRIES)
+    entries_before = dict(registry._ENTRIES)
     spec.loader.exec_module(module)
     yield module
     registry._ENTRIES.clear()
-    registry._ENTRIES.update(before)
+    registry._ENTRIES.update(entries_before)
 
 
 @pytest.fixture(scope="module")
@@ -73,16 +73,16 @@ def test_a_free_finger_is_refused_by_name(page, targets):
 
 
 def test_names_are_taken_once(page):
-    method, known = page.DampedLeastSquares, page.DampedParameters
+    method, parameter_class = page.DampedLeastSquares, page.DampedParameters
     with pytest.raises(errors.InputError, match="name: method 'damped-least-squares'"):
-        ik.register_method(method.name, "again", known, method)
-    ik.register_method(method.name, "again", known, method, replace=True)
+        ik.register_method(method.name, "again", parameter_class, method)
+    ik.register_method(method.name, "again", parameter_class, method, replace=True)
     assert registry.method_summary(method.name) == "again"
     assert registry.method_names() == (*ik.METHODS, method.name)
     with pytest.raises(errors.InputError, match="name: method 'ipopt'"):
-        ik.register_method("ipopt", "mine", known, method, replace=True)
+        ik.register_method("ipopt", "mine", parameter_class, method, replace=True)
     with pytest.raises(errors.InputError, match="expected a dataclass"):
         ik.register_method("other", "mine", dict, method)
-    ik.register_method("misnamed", "calls itself otherwise", known, method)
+    ik.register_method("misnamed", "calls itself otherwise", parameter_class, method)
     with pytest.raises(errors.InputError, match=r"method: .*'damped-least-squares'"):
         ik.Solver(page.robot, "misnamed")

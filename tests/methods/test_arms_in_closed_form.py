@@ -30,19 +30,19 @@ def solver(panda) -> ik.Solver:
 
 
 @pytest.mark.parametrize(
-    ("method", "tolerance", "least"),
+    ("method", "tolerance", "min_solved"),
     [
         ("hand-first", ik.Tolerance(), 1),
         ("hand-first", EXACT, 1),
         ("thumb-first", ik.Tolerance(), 0.95),
     ],
 )
-def test_an_arm_without_a_closed_form(tmp_path_factory, method, tolerance, least):
+def test_an_arm_without_a_closed_form(tmp_path_factory, method, tolerance, min_solved):
     robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
     # Few enough that no second kernel is compiled for many side by side.
     q = robot.random(np.random.default_rng(5), 60)
     batch = ik.Solver(robot, method, tolerance).solve_batch(*robot.contacts(q))
-    assert batch.success.mean() >= least
+    assert batch.success.mean() >= min_solved
     if method == "hand-first":  # nearly all by the arm stage, not by the whole-system stage
         assert np.mean(batch.phases["refinement"] == 0) > 0.9
     else:
@@ -80,8 +80,8 @@ def test_targets_of_a_panda_with_a_joint_next_to_its_limit(panda, solver):
     rng = np.random.default_rng(3)
     q = panda.random(rng, 400)
     joint, side = rng.integers(0, 7, len(q)), rng.integers(0, 2, len(q)).astype(bool)
-    rows, near = np.arange(len(q)), np.radians(0.003)
-    q[rows, joint] = np.where(side, panda.lower[joint] + near, panda.upper[joint] - near)
+    rows, margin = np.arange(len(q)), np.radians(0.003)
+    q[rows, joint] = np.where(side, panda.lower[joint] + margin, panda.upper[joint] - margin)
     assert solver.solve_batch(*panda.contacts(q)).success.all()
 
 
@@ -100,15 +100,23 @@ def with_hand(robot, arms, hand):
 def test_short_stretches_of_the_swept_joint_are_found(panda, solver):
     """With six of seven joints next to their limits some are a few ten-thousandths long."""
     hand = held_hand(panda)
-    one = [0.12332358, -1.75856779, 2.88167321, -0.95126358, -2.89537776, -0.01444861, 2.88507954]
-    many = near_limits(panda, np.random.default_rng(12), 1000)[:, :7]
-    q = with_hand(panda, np.concatenate([[one], many]), hand)
+    q_missed = [
+        0.12332358,
+        -1.75856779,
+        2.88167321,
+        -0.95126358,
+        -2.89537776,
+        -0.01444861,
+        2.88507954,
+    ]
+    targets = near_limits(panda, np.random.default_rng(12), 1000)[:, :7]
+    q = with_hand(panda, np.concatenate([[q_missed], targets]), hand)
     batch = solver.solve_batch(*panda.contacts(q), fixed=hand)
     assert np.flatnonzero(~batch.success).tolist() == []
     # What the first round misses, most of the second's first trials find.
-    again = batch.restarts[batch.restarts > 0]
-    assert len(again) > 3
-    assert np.median(again) == solver.parameters["options"]["candidates"]
+    used_restarts = batch.restarts[batch.restarts > 0]
+    assert len(used_restarts) > 3
+    assert np.median(used_restarts) == solver.parameters["options"]["candidates"]
 
 
 def test_a_straight_arm_that_is_nearly_in_closed_form():
@@ -130,10 +138,12 @@ def test_what_is_near_a_panda_is_found(panda, solver):
         q + np.random.default_rng(5).normal(scale=0.3, size=q.shape), panda.lower, panda.upper
     )
     contacts = panda.contacts(q)
-    near = solver.solve_batch(*contacts, q0=start, prefer="q0")
-    far = solver.solve_batch(*contacts)
-    assert near.success.all()
-    near_by, far_by = (np.abs(each.q - start)[:, :7].max(axis=1) for each in (near, far))
+    near_batch = solver.solve_batch(*contacts, q0=start, prefer="q0")
+    limits_batch = solver.solve_batch(*contacts)
+    assert near_batch.success.all()
+    near_by, far_by = (
+        np.abs(batch.q - start)[:, :7].max(axis=1) for batch in (near_batch, limits_batch)
+    )
     assert np.median(near_by) < 0.5 * np.median(far_by)
 
 
@@ -147,18 +157,20 @@ def test_what_is_near_an_arm_whose_last_joint_is_searched_is_found(name):
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
     batch = solver.solve_batch(*robot.contacts(q), q0=start, prefer="q0")
     assert batch.success.all()
-    moved, known = (np.abs(each - start)[:, :6].max(axis=1) for each in (batch.q, q))
-    assert (moved < 1.5 * known + 0.05).mean() > 0.9
+    batch_distance, known_distance = (
+        np.abs(q_rows - start)[:, :6].max(axis=1) for q_rows in (batch.q, q)
+    )
+    assert (batch_distance < 1.5 * known_distance + 0.05).mean() > 0.9
 
 
 def test_all_solutions_of_a_panda(panda, solver):
     q = panda.random(np.random.default_rng(6), 1)[0]
-    found = solver.solve_all(grasp_at(panda, q), limit=100, apart=0)
-    assert len(found) > 1
-    for one in found:
-        assert all(contact.ok for contact in one.contacts.values())
-        assert one.branch is not None
-        assert one.branch.swivel is not None
-        start, end = one.branch.swivel
-        assert start - 1e-9 <= one.swivel <= end + 1e-9
-    assert len({(one.posture, one.branch) for one in found}) == len(found)
+    solutions = solver.solve_all(grasp_at(panda, q), limit=100, apart=0)
+    assert len(solutions) > 1
+    for solution in solutions:
+        assert all(contact.ok for contact in solution.contacts.values())
+        assert solution.branch is not None
+        assert solution.branch.swivel is not None
+        start, end = solution.branch.swivel
+        assert start - 1e-9 <= solution.swivel <= end + 1e-9
+    assert len({(solution.posture, solution.branch) for solution in solutions}) == len(solutions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from toy_robots import grasp_of, moved
+from toy_robots import grasp_of, moved_targets
 
 import casadi_ik as ik
 
@@ -17,7 +17,9 @@ ALL = "kuka_lwr_barrett"
 def displaced(robot, rng, count, part, fingers=None):
     """Contacts of configurations, moved and turned by a part of the tolerance: still met by q."""
     contacts = robot.contacts(robot.random(rng, count))
-    points, normals = moved(contacts, rng, part * TOLERANCE.position, part * TOLERANCE.angle)
+    points, normals = moved_targets(
+        contacts, rng, part * TOLERANCE.position, part * TOLERANCE.angle
+    )
     free = [name not in (fingers or robot.fingers) for name in robot.fingers]
     points[:, free] = normals[:, free] = np.nan
     return points, normals
@@ -48,14 +50,18 @@ def test_limits_and_held_actuators_are_kept(robot):
     balanced = np.flatnonzero((free.phases["balance"] > 0) & free.success)
     assert len(balanced)
     assert ((free.q >= robot.lower) & (free.q <= robot.upper)).all()
-    spread, again = robot.actuators.index("bh_spread"), 0
+    spread, fixed_count = robot.actuators.index("bh_spread"), 0
     for row in balanced[:20]:
-        held = float(np.clip(free.q[row, spread] + 0.005, robot.lower[spread], robot.upper[spread]))
-        one = slice(row, row + 1)
-        batch = ik.Solver(robot).solve_batch(points[one], normals[one], fixed={"bh_spread": held})
-        assert batch.q[0, spread] == held
-        again += batch.phases["balance"].sum()
-    assert again
+        value = float(
+            np.clip(free.q[row, spread] + 0.005, robot.lower[spread], robot.upper[spread])
+        )
+        row_slice = slice(row, row + 1)
+        batch = ik.Solver(robot).solve_batch(
+            points[row_slice], normals[row_slice], fixed={"bh_spread": value}
+        )
+        assert batch.q[0, spread] == value
+        fixed_count += batch.phases["balance"].sum()
+    assert fixed_count
 
 
 def test_alone_in_a_batch_and_in_blocks_the_answer_is_the_same(robot):
@@ -68,10 +74,10 @@ def test_alone_in_a_batch_and_in_blocks_the_answer_is_the_same(robot):
     rows = np.flatnonzero(batch.phases["balance"])[:8]
     assert len(rows)
     for row in rows:
-        alone = solver.solve(grasp_of(robot, points[row], normals[row]), diagnose=False)
+        solution = solver.solve(grasp_of(robot, points[row], normals[row]), diagnose=False)
         # A grasp normalises its normals itself, so the last digit may differ.
-        np.testing.assert_allclose(alone.q, batch.q[row], atol=1e-6)
-        assert alone.success == batch.success[row]
+        np.testing.assert_allclose(solution.q, batch.q[row], atol=1e-6)
+        assert solution.success == batch.success[row]
 
 
 def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(robot):

@@ -17,7 +17,7 @@ HANDS = [
 """Spread, thumb, finger 2, finger 3 (proximal, distal) [deg]: every candidate lay on the other side
 of the spread."""
 
-LOST = (87_229, 638_806)
+MISSED_ROWS = (87_229, 638_806)
 """Rows of a million random configurations that were not solved."""
 
 # By what was in the way: robot, tolerance, motors that are held, configurations.
@@ -101,15 +101,15 @@ ONCE_MISSED = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("why", ONCE_MISSED)
-def test_what_was_missed_once_is_solved(why):
-    name, tolerance, held, *rows = ONCE_MISSED[why]
+@pytest.mark.parametrize("case", ONCE_MISSED)
+def test_what_was_missed_once_is_solved(case):
+    name, tolerance, fixed_joints, *rows = ONCE_MISSED[case]
     robot = ik.load_robot(name)
     solver = ik.Solver(robot, tolerance=tolerance)
     for q in (np.array(row.split(), dtype=float) for row in rows):
         assert (q >= robot.lower - 1e-9).all()
         assert (q <= robot.upper + 1e-9).all()
-        fixed = {motor: q[robot.actuators.index(motor)] for motor in held}
+        fixed = {motor: q[robot.actuators.index(motor)] for motor in fixed_joints}
         assert solver.solve_batch(*robot.contacts(q[None]), fixed=fixed).success.all()
 
 
@@ -129,15 +129,15 @@ def test_hands_on_many_arms(robot, solver, rng, hand, off):
 
 
 def test_rows_that_were_lost(robot, solver):
-    q = robot.random(np.random.default_rng(0), 1_000_000)[list(LOST)]
+    q = robot.random(np.random.default_rng(0), 1_000_000)[list(MISSED_ROWS)]
     assert solver.solve_batch(*robot.contacts(q)).success.all()
 
 
 def test_arms_at_either_end_of_nearly_a_full_turn():
     """Nearly all of those missed among corners had joints there: 17 of 10,000."""
     robot, rng = ik.load_robot("baxter_ar10"), np.random.default_rng(4)
-    q, where = robot.random(rng, 500), rng.integers(0, 3, (500, len(robot.lower)))
-    q = np.where(where == 0, robot.lower, np.where(where == 1, robot.upper, q))
+    q, fixed_index = robot.random(rng, 500), rng.integers(0, 3, (500, len(robot.lower)))
+    q = np.where(fixed_index == 0, robot.lower, np.where(fixed_index == 1, robot.upper, q))
     q[:, 3], q[:, 5] = robot.lower[3], robot.upper[5]
     q[:, 4] = np.where(rng.random(500) < 0.5, robot.lower[4], robot.upper[4])
     assert ik.Solver(robot, tolerance=EXACT).solve_batch(*robot.contacts(q)).success.all()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from toy_robots import near_home
-from trace_checks import Kept
+from trace_checks import TraceRecorder
 
 import casadi_ik as ik
 from casadi_ik import logs
@@ -54,21 +54,23 @@ KINDS = (
 )
 
 
-def off(frame: np.ndarray, asked: ik.Contact) -> tuple[float, float]:
+def off(frame: np.ndarray, requested: ik.Contact) -> tuple[float, float]:
     """Distance [m] and angle [rad] of a fingertip from a contact, NaN where free."""
-    beside, angle = frame[:3, 3] - asked.point, np.nan
+    beside, angle = frame[:3, 3] - requested.point, np.nan
     distance = float(np.linalg.norm(beside))
-    if asked.line is not None:
-        distance = float(np.linalg.norm(beside - asked.line * (asked.line @ beside)))
-    if asked.plane is not None:
-        distance = abs(float(asked.plane @ beside))
-    if asked.ball is not None:
+    if requested.line is not None:
+        distance = float(np.linalg.norm(beside - requested.line * (requested.line @ beside)))
+    if requested.plane is not None:
+        distance = abs(float(requested.plane @ beside))
+    if requested.ball is not None:
         middle = frame[:3, 3] - RADIUS * frame[:3, 0]
-        distance = float(np.linalg.norm(middle + RADIUS * asked.ball - asked.point))
-    if asked.normal is not None:
-        angle = float(np.arccos(np.clip(asked.normal @ frame[:3, 0], -1, 1)))
-    if asked.tangent is not None:
-        axes = np.stack([asked.normal, asked.tangent, np.cross(asked.normal, asked.tangent)], 1)
+        distance = float(np.linalg.norm(middle + RADIUS * requested.ball - requested.point))
+    if requested.normal is not None:
+        angle = float(np.arccos(np.clip(requested.normal @ frame[:3, 0], -1, 1)))
+    if requested.tangent is not None:
+        axes = np.stack(
+            [requested.normal, requested.tangent, np.cross(requested.normal, requested.tangent)], 1
+        )
         cosine = (np.trace(axes.T @ frame[:3, :3]) - 1) / 2
         angle = float(np.arccos(np.clip(cosine, -1, 1)))
     return distance, angle
@@ -76,14 +78,14 @@ def off(frame: np.ndarray, asked: ik.Contact) -> tuple[float, float]:
 
 def pinocchio_frames(oracle, q):
     """Contact frames (f, 4, 4) from the written URDF by pinocchio."""
-    poses, found = oracle.frames(q), []
+    poses, contact_frames = oracle.frames(q), []
     for finger in oracle.robot.description.fingers:
         pose = poses[f"{finger.name}_contact"]
         axes = [finger.normal, finger.tangent, np.cross(finger.normal, finger.tangent)]
         frame = pose.copy()
         frame[:3, :3] = pose[:3, :3] @ np.stack(axes, axis=1)
-        found.append(frame)
-    return np.array(found)
+        contact_frames.append(frame)
+    return np.array(contact_frames)
 
 
 @pytest.fixture(scope="module")
@@ -93,9 +95,11 @@ def solvers(robot):
 
 
 def test_contact_frames_are_pinocchios(robot, coupled_robot, oracle, coupled_oracle, rng):
-    for one, other in ((robot, oracle), (coupled_robot, coupled_oracle)):
-        for q in one.random(rng, 5):
-            np.testing.assert_allclose(one.contact_frames(q), pinocchio_frames(other, q), atol=1e-9)
+    for model, model_oracle in ((robot, oracle), (coupled_robot, coupled_oracle)):
+        for q in model.random(rng, 5):
+            np.testing.assert_allclose(
+                model.contact_frames(q), pinocchio_frames(model_oracle, q), atol=1e-9
+            )
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -109,9 +113,9 @@ def test_every_kind_is_solved(robot, oracle, solvers, method, kind):
     }
     solution = solvers[method].solve(ik.Grasp(contacts))
     assert solution.success, solution
-    there = pinocchio_frames(oracle, solution.q)
+    frames_reached = pinocchio_frames(oracle, solution.q)
     for i, name in enumerate(robot.fingers):
-        distance, angle = off(there[i], contacts[name])
+        distance, angle = off(frames_reached[i], contacts[name])
         verdict = solution.contacts[name]
         np.testing.assert_allclose(verdict.position_error, distance, atol=1e-8)
         np.testing.assert_allclose(verdict.angle_error, angle, atol=1e-6)
@@ -121,14 +125,14 @@ def test_every_kind_is_solved(robot, oracle, solvers, method, kind):
 
 @pytest.mark.parametrize("free", ["finger", "normal", "thumb", "all normals", "all but one finger"])
 @pytest.mark.parametrize(
-    ("method", "tolerance", "least"),
+    ("method", "tolerance", "min_solved"),
     [
         ("hand-first", ik.Tolerance(), 1),
         ("hand-first", ik.Tolerance(1e-6, 1e-6), 1),
         ("thumb-first", ik.Tolerance(), 0.93),
     ],
 )
-def test_what_is_free_has_no_rows(robot, rng, method, tolerance, least, free):
+def test_what_is_free_has_no_rows(robot, rng, method, tolerance, min_solved, free):
     """Solved, and the log measures nothing of it."""
     points, normals = robot.contacts(robot.random(rng, 120))
     rows, finger = np.arange(120), rng.integers(0, 3, 120)
@@ -143,19 +147,21 @@ def test_what_is_free_has_no_rows(robot, rng, method, tolerance, least, free):
         normals[:] = np.nan
     else:
         points[:, :2] = normals[:, :2] = np.nan
-    solver, kept = ik.Solver(robot, method, tolerance), Kept()
+    solver, recorder = ik.Solver(robot, method, tolerance), TraceRecorder()
     batch = solver.solve_batch(points, normals)
-    assert batch.success.mean() >= least
+    assert batch.success.mean() >= min_solved
     assert batch.limits_ok.all()
-    solver.solve_batch(points[:5], normals[:5], log=kept)
-    (block,) = kept.blocks
-    given = [
+    solver.solve_batch(points[:5], normals[:5], log=recorder)
+    (block,) = recorder.blocks
+    is_given = [
         np.repeat(~np.isnan(x[:5, :, 0]), block.batch.iterations, 0) for x in (points, normals)
     ]
     measured = np.isfinite(block.rows["position_error"]).any(axis=1)
     assert measured.any()
-    for name, known in zip(("position_error", "angle_error"), given, strict=True):
-        np.testing.assert_array_equal(np.isfinite(block.rows[name])[measured], known[measured])
+    for name, expected_mask in zip(("position_error", "angle_error"), is_given, strict=True):
+        np.testing.assert_array_equal(
+            np.isfinite(block.rows[name])[measured], expected_mask[measured]
+        )
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -165,8 +171,8 @@ def test_whole_poses_of_all_fingers(robot, oracle, solvers, method):
     contacts = dict(zip(robot.fingers, (contact("pose", frame) for frame in at), strict=True))
     solution = solvers[method].solve(ik.Grasp(contacts))
     assert solution.success, solution
-    for frame, wanted in zip(pinocchio_frames(oracle, solution.q), at, strict=True):
-        np.testing.assert_allclose(frame[:3, :3], wanted[:3, :3], atol=2e-3)
+    for frame, goal in zip(pinocchio_frames(oracle, solution.q), at, strict=True):
+        np.testing.assert_allclose(frame[:3, :3], goal[:3, :3], atol=2e-3)
 
 
 @pytest.mark.parametrize("method", PAPER)
@@ -186,20 +192,20 @@ def test_a_target_has_the_same_answer_in_any_company(robot, solvers, method):
     points, normals, tangents = at[..., :3, 3], at[..., :3, 0], at[..., :3, 1].copy()
     planes = np.full_like(points, np.nan)
     tangents[1], tangents[2, 1:], planes[3, 0] = np.nan, np.nan, UP
-    more = {"tangents": tangents, "planes": planes}
+    arrays = {"tangents": tangents, "planes": planes}
     solver = solvers[method]
-    batch = solver.solve_batch(points, normals, seed=3, **more)
+    batch = solver.solve_batch(points, normals, seed=3, **arrays)
     assert batch.success.all()
     blocks = [
         {"points": points[i : i + 1], "normals": normals[i : i + 1]}
-        | {name: array[i : i + 1] for name, array in more.items()}
+        | {name: array[i : i + 1] for name, array in arrays.items()}
         for i in range(4)
     ]
-    apart = [block.solution for block in solver.solve_blocks(blocks, seed=3)]
-    for i, one in enumerate(apart):
-        np.testing.assert_array_equal(one.q[0], batch.q[i])
-        np.testing.assert_array_equal(one.angle_error[0], batch.angle_error[i])
-        assert one.iterations[0] == batch.iterations[i]
+    separate_answers = [block.solution for block in solver.solve_blocks(blocks, seed=3)]
+    for i, answer in enumerate(separate_answers):
+        np.testing.assert_array_equal(answer.q[0], batch.q[i])
+        np.testing.assert_array_equal(answer.angle_error[0], batch.angle_error[i])
+        assert answer.iterations[0] == batch.iterations[i]
 
 
 def test_a_batch_may_hold_directions_alone(robot, solvers):
@@ -222,8 +228,8 @@ def test_a_batch_may_hold_directions_alone(robot, solvers):
         name: ik.Contact(points[1, i], normals[1, i]) for i, name in enumerate(robot.fingers) if i
     }
     grasp = ik.Grasp({robot.fingers[0]: ik.Contact(direction=directions[1, 0]), **contacts})
-    one = solver.solve(grasp)
-    np.testing.assert_allclose(one.q, batch.q[1], atol=1e-12)
+    single_solution = solver.solve(grasp)
+    np.testing.assert_allclose(single_solution.q, batch.q[1], atol=1e-12)
     with pytest.raises(ik.errors.RowError, match=r"directions:.*1.*0"):
         solver.solve_batch(at[..., :3, 3], at[..., :3, 0], directions=directions)
 
@@ -257,28 +263,34 @@ def test_what_was_asked_stands_in_the_log(robot, solvers, tmp_path: Path):
     path = tmp_path / "asked.mcap"
     first = solvers["ipopt"].solve(grasp, log=path)
     solve = logs.one_solve(ik.logs.open(path))
-    asked = {"points": solve.target_points, "normals": solve.target_normals, **solve.target_more}
-    for name, one in grasp.contacts.items():
+    expected_arrays = {
+        "points": solve.target_points,
+        "normals": solve.target_normals,
+        **solve.target_more,
+    }
+    for name, contact_asked in grasp.contacts.items():
         row = robot.fingers.index(name)
         for vector in ("point", "normal", "tangent", "line", "plane", "ball"):
-            given = getattr(one, vector)
-            logged = asked.get(f"{vector}s", np.full((3, 3), np.nan))[row]
-            np.testing.assert_array_equal(logged, np.full(3, np.nan) if given is None else given)
+            vector_of_contact = getattr(contact_asked, vector)
+            logged = expected_arrays.get(f"{vector}s", np.full((3, 3), np.nan))[row]
+            np.testing.assert_array_equal(
+                logged, np.full(3, np.nan) if vector_of_contact is None else vector_of_contact
+            )
     free = np.isnan(solve.target_points[:, 0])
-    again = {}
+    vectors = {}
     for row, name in enumerate(robot.fingers):
-        more = {
+        arrays = {
             key[:-1]: array[row]
             for key, array in solve.target_more.items()
             if not np.isnan(array[row]).any()
         }
         normal = solve.target_normals[row]
         if free[row]:
-            again[name] = ik.Contact(direction=normal)
+            vectors[name] = ik.Contact(direction=normal)
         else:
-            given = None if np.isnan(normal).any() else normal
-            again[name] = ik.Contact(solve.target_points[row], given, **more)
-    second = solvers["ipopt"].solve(ik.Grasp(again))
+            vector_of_contact = None if np.isnan(normal).any() else normal
+            vectors[name] = ik.Contact(solve.target_points[row], vector_of_contact, **arrays)
+    second = solvers["ipopt"].solve(ik.Grasp(vectors))
     np.testing.assert_allclose(second.q, first.q, atol=1e-6)
     assert second.status == first.status
 
@@ -300,7 +312,9 @@ def test_why_a_pose_is_not_solved(robot, oracle, solvers):
         np.testing.assert_allclose((missed.position_error, missed.angle_error), expected, atol=1e-6)
     assert solution.diagnosis is not None
     assert solution.diagnosis.nearest["finger_2"].angle_error > 0.1
-    assert ("normal", "finger_2") in [(one.part, one.finger) for one in solution.diagnosis.freed]
+    assert ("normal", "finger_2") in [
+        (freed.part, freed.finger) for freed in solution.diagnosis.freed
+    ]
 
 
 FILE = """\
@@ -324,10 +338,10 @@ contacts:
 def test_grasp_files(tmp_path: Path, thumb, expected):
     path = tmp_path / "grasp.yaml"
     path.write_text(FILE.format(thumb=thumb))
-    found = ik.load_grasp(path).contacts["thumb"]
+    thumb_contact = ik.load_grasp(path).contacts["thumb"]
     for name, value in expected.items():
-        np.testing.assert_array_equal(getattr(found, name), value)
-    assert np.isnan(found.point).all() == ("direction" in thumb)
+        np.testing.assert_array_equal(getattr(thumb_contact, name), value)
+    assert np.isnan(thumb_contact.point).all() == ("direction" in thumb)
 
 
 @pytest.mark.parametrize(
@@ -364,7 +378,7 @@ def test_bad_arrays(robot, solvers):
     def bad(value):
         return np.concatenate([tangents[:4], value])
 
-    for more, facing, message in (
+    for arrays, facing, message in (
         (
             {"tangents": bad(tangents[4:] + 0.01 * normals[4:])},
             normals,
@@ -376,8 +390,8 @@ def test_bad_arrays(robot, solvers):
         ({"lines": tangents, "planes": bad(tangents[4:])}, normals, "line and plane: found both"),
     ):
         with pytest.raises(ik.errors.RowError, match=message) as caught:
-            solver.solve_batch(points, facing, **more)
-        assert caught.value.row == (0 if "lines" in more else 4)
+            solver.solve_batch(points, facing, **arrays)
+        assert caught.value.row == (0 if "lines" in arrays else 4)
     with pytest.raises(ik.errors.InputError, match=r"tangents:.*\(5, 3\).*\(5, 3, 3\)"):
         solver.solve_batch(points, normals, tangents=tangents[..., 0])
 
@@ -385,13 +399,13 @@ def test_bad_arrays(robot, solvers):
 def test_no_proof_counts_a_contact_that_may_slide(robot, solvers):
     """Its point is far out of reach; the plane through it is not."""
     at = frames(robot)
-    far = at[0, :3, 3] + [5.0, 5.0, 0.0]
-    others = {
+    far_point = at[0, :3, 3] + [5.0, 5.0, 0.0]
+    other_contacts = {
         name: ik.Contact(at[i, :3, 3], at[i, :3, 0]) for i, name in enumerate(robot.fingers) if i
     }
     for first, status in (
-        (ik.Contact(far, at[0, :3, 0]), ik.Status.UNREACHABLE),
-        (ik.Contact(far, at[0, :3, 0], plane=UP), ik.Status.SOLVED),
+        (ik.Contact(far_point, at[0, :3, 0]), ik.Status.UNREACHABLE),
+        (ik.Contact(far_point, at[0, :3, 0], plane=UP), ik.Status.SOLVED),
     ):
-        asked = ik.Grasp({**others, robot.fingers[0]: first})
-        assert solvers["hand-first"].solve(asked).status is status
+        grasp = ik.Grasp({**other_contacts, robot.fingers[0]: first})
+        assert solvers["hand-first"].solve(grasp).status is status

@@ -138,9 +138,9 @@ def test_fields_of_a_batch(case):
     assert set(batch.status_names) <= {status.name for status in ik.Status}
     np.testing.assert_array_equal(sum(batch.phases.values()), batch.iterations)
     np.testing.assert_array_equal(batch.success, batch.status_names == "SOLVED")
-    again = pickle.loads(pickle.dumps(batch))
-    fields_equal(batch, again)
-    row = again.solution(k - 1)
+    restored = pickle.loads(pickle.dumps(batch))
+    fields_equal(batch, restored)
+    row = restored.solution(k - 1)
     assert tuple(row.contacts) == case.robot.fingers
     assert (row.method, row.robot) == (case.method, case.robot.name)
     assert row.actuators == case.robot.actuators
@@ -157,8 +157,8 @@ def test_success_is_what_pinocchio_says(case):
 
 def test_targets_near_home_are_solved(case):
     batch = case.solver().solve_batch(case.points, case.normals)
-    least = 0 if case.method.startswith("original") else 6
-    assert batch.success.sum() >= least, batch.status_names
+    min_solved = 0 if case.method.startswith("original") else 6
+    assert batch.success.sum() >= min_solved, batch.status_names
 
 
 def test_the_same_seed_gives_the_same_answer(case):
@@ -177,10 +177,12 @@ def test_a_batch_is_its_single_solves(case):
     assert batch.status[0] == single.status
     assert batch.iterations[0] == single.iterations
     if case.method in PAPER:  # no random numbers: any row is its own solve
-        whole = solver.solve_batch(case.points, case.normals)
+        whole_batch = solver.solve_batch(case.points, case.normals)
         for row in range(3):
-            alone = solver.solve_batch(case.points[row : row + 1], case.normals[row : row + 1])
-            np.testing.assert_array_equal(whole.q[row], alone.q[0])
+            single_batch = solver.solve_batch(
+                case.points[row : row + 1], case.normals[row : row + 1]
+            )
+            np.testing.assert_array_equal(whole_batch.q[row], single_batch.q[0])
 
 
 def test_a_batch_goes_side_by_side(case):
@@ -199,15 +201,15 @@ def test_a_batch_goes_side_by_side(case):
         for point, normal in zip(case.points, case.normals, strict=True)
     ]
     batch = case.fresh_solver().solve_batch(case.points, case.normals)
-    for row, alone in enumerate(one_by_one):
-        fields_equal(batch, alone, slice(row, row + 1))
+    for row, single_batch in enumerate(one_by_one):
+        fields_equal(batch, single_batch, slice(row, row + 1))
 
 
 def test_threads_change_nothing(case):
     solver = case.solver()
-    one = solver.solve_batch(case.points, case.normals, jobs=1, seed=1)
-    fields_equal(one, solver.solve_batch(case.points, case.normals, jobs=2, seed=1))
-    fields_equal(one, solver.solve_batch(case.points, case.normals, jobs=50, seed=1))
+    sequential = solver.solve_batch(case.points, case.normals, jobs=1, seed=1)
+    fields_equal(sequential, solver.solve_batch(case.points, case.normals, jobs=2, seed=1))
+    fields_equal(sequential, solver.solve_batch(case.points, case.normals, jobs=50, seed=1))
 
 
 def test_starts_row_by_row(case):
@@ -218,14 +220,14 @@ def test_starts_row_by_row(case):
         solver.solve_batch(case.points, case.normals, q0=robot.home),
         solver.solve_batch(case.points, case.normals, q0=q0),
     )
-    same = {"prefer": "limits"} if case.method in CHOOSING else {}
+    preference = {"prefer": "limits"} if case.method in CHOOSING else {}
     home = solver.solve_batch(case.points, case.normals)
-    fields_equal(home, solver.solve_batch(case.points, case.normals, q0=q0, **same))
-    before = q0.copy()
+    fields_equal(home, solver.solve_batch(case.points, case.normals, q0=q0, **preference))
+    q0_before = q0.copy()
     q0[1] = 0.5 * (robot.lower + robot.upper)
-    moved = solver.solve_batch(case.points, case.normals, q0=q0, **same)
-    np.testing.assert_array_equal(moved.q[0], home.q[0])
-    np.testing.assert_array_equal(before[0], q0[0], "starts are not written to")
+    shifted_batch = solver.solve_batch(case.points, case.normals, q0=q0, **preference)
+    np.testing.assert_array_equal(shifted_batch.q[0], home.q[0])
+    np.testing.assert_array_equal(q0_before[0], q0[0], "starts are not written to")
 
 
 def test_a_start_that_solves_already_is_the_answer(case):
@@ -259,9 +261,9 @@ def test_a_log_changes_no_number(case, tmp_path):
     solver = case.solver()
     path = tmp_path / "solve.mcap"
     for count in (1, len(case.points)):  # alone, and side by side
-        asked = case.points[:count], case.normals[:count]
-        plain = solver.solve_batch(*asked, seed=4)
-        fields_equal(plain, solver.solve_batch(*asked, seed=4, log=path))
+        targets = case.points[:count], case.normals[:count]
+        plain = solver.solve_batch(*targets, seed=4)
+        fields_equal(plain, solver.solve_batch(*targets, seed=4, log=path))
     log = ik.logs.open(path)
     solves = log.solves().rows
     np.testing.assert_array_equal(solves["solve_id"], np.arange(len(case.points)))
@@ -270,8 +272,8 @@ def test_a_log_changes_no_number(case, tmp_path):
     np.testing.assert_array_equal(solves["success"], plain.success)
     np.testing.assert_array_equal(solves["target_points"], case.points)
     assert [row["status"] for row in log.solves().records()] == plain.status_names.tolist()
-    found = log.iterations()
-    np.testing.assert_array_equal(np.bincount(found.solve_id), plain.iterations)
+    rows = log.iterations()
+    np.testing.assert_array_equal(np.bincount(rows.solve_id), plain.iterations)
     assert log.attachment("robot.urdf").decode() == case.robot.urdf()
     parameters = log.metadata["parameters"]
     assert parameters["method"] == case.method
@@ -323,13 +325,13 @@ def test_a_grasp_of_another_hand(case):
 
 
 def test_parameters_say_everything(case):
-    found = case.solver().parameters
-    assert found["method"] == case.method
-    assert found["tolerance"] == {
+    parameters = case.solver().parameters
+    assert parameters["method"] == case.method
+    assert parameters["tolerance"] == {
         name: {"position": 5e-3, "angle": math.radians(3)} for name in case.robot.fingers
     }
-    assert found["limits"] == "enforce"
-    assert isinstance(found["options"], dict)
+    assert parameters["limits"] == "enforce"
+    assert isinstance(parameters["options"], dict)
     assert case.method in repr(case.solver())
 
 

@@ -24,8 +24,8 @@ def test_targets_with_a_joint_next_to_its_limit(robot, exact, rng):
     q = robot.random(rng, 400)
     joint = rng.integers(0, 7, len(q))
     side = rng.integers(0, 2, len(q)).astype(bool)
-    rows, near = np.arange(len(q)), np.radians(0.003)
-    q[rows, joint] = np.where(side, robot.lower[joint] + near, robot.upper[joint] - near)
+    rows, margin = np.arange(len(q)), np.radians(0.003)
+    q[rows, joint] = np.where(side, robot.lower[joint] + margin, robot.upper[joint] - margin)
     batch = exact.solve_batch(*robot.contacts(q))
     assert batch.success.all()
     # Most of them without the whole-system stage: the closed form found the interval.
@@ -40,8 +40,8 @@ def test_without_limits_everything_is_solved_too(robot, rng):
 def test_out_of_reach_the_contacts_come_near(robot, exact, rng):
     """Not solved; what comes back is finite, within limits and stretched towards the target."""
     points, normals = robot.contacts(robot.random(rng, 20))
-    away = points.mean(axis=1, keepdims=True)
-    points = points + 2.0 * away / np.linalg.norm(away, axis=2, keepdims=True)
+    offsets = points.mean(axis=1, keepdims=True)
+    points = points + 2.0 * offsets / np.linalg.norm(offsets, axis=2, keepdims=True)
     batch = exact.solve_batch(points, normals)
     assert not batch.success.any()
     assert np.isfinite(batch.q).all()
@@ -54,15 +54,15 @@ def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
     # One after the other with an arm, many at once without: each compiles the shorter half.
     hand = ik.load_robot("ar10")
     with_arm = robot.contacts(robot.random(rng, 20))
-    alone = hand.contacts(hand.random(rng, 100))
+    single_points = hand.contacts(hand.random(rng, 100))
 
     def answers() -> bytes:
         fast, q = ik.Solver(robot).fast(), []
         for points, normals in zip(*with_arm, strict=True):
-            found, status = fast(points, normals)
+            answers_found, status = fast(points, normals)
             assert status == ik.Status.SOLVED
-            q.append(found.copy())
-        batch = ik.Solver(hand).solve_batch(*alone)
+            q.append(answers_found.copy())
+        batch = ik.Solver(hand).solve_batch(*single_points)
         assert batch.success.all()
         return np.array(q).tobytes() + batch.q.tobytes() + batch.iterations.tobytes()
 
@@ -79,7 +79,7 @@ def test_without_a_compiler_a_round_is_the_same(tmp_path, rng, offset):
     points, normals = robot.contacts(q)
     points += rng.normal(0, 0.005, points.shape)
     starts = np.where(np.arange(25)[:, None] % 2, robot.home, q + 0.02)
-    seen = set()
+    statuses = set()
     for prefer, tolerance in (("limits", usual), ("limits", EXACT), ("q0", usual)):
         fast, slow = (
             ik.Solver(
@@ -91,9 +91,9 @@ def test_without_a_compiler_a_round_is_the_same(tmp_path, rng, offset):
         np.testing.assert_array_equal(fast.restarts, slow.restarts)
         if prefer == "limits":  # of several that are near, the last places of a sine may decide
             np.testing.assert_allclose(fast.q, slow.q, atol=1e-7)
-        seen |= {name for name, count in fast.phases.items() if count.any()}
+        statuses |= {name for name, count in fast.phases.items() if count.any()}
     # Few targets come to a balance, which the tolerant fits precede.
-    assert seen | {"balance"} == set(fast.phases) - ({"arm-choice"} if offset else set())
+    assert statuses | {"balance"} == set(fast.phases) - ({"arm-choice"} if offset else set())
 
 
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
@@ -102,16 +102,18 @@ def test_what_is_out_of_reach_ends_the_same_alone_and_in_a_batch(ar10, rng, pref
     points, normals = ar10.contacts(ar10.random(rng, 6))
     points = points + rng.normal(0, 0.008, points.shape)
     solver = ik.Solver(ar10)
-    many = solver.solve_batch(points, normals, prefer=prefer)
-    assert not many.success.all()
-    assert many.restarts.max() > 100
-    alone = solver.fast()
+    batch = solver.solve_batch(points, normals, prefer=prefer)
+    assert not batch.success.all()
+    assert batch.restarts.max() > 100
+    fast_solver = solver.fast()
     for row in range(len(points)):
-        q, _ = alone(points[row], normals[row], ar10.home if prefer == "q0" else None)
-        np.testing.assert_array_equal(q, many.q[row])
-        one = solver.solve_batch(points[row : row + 1], normals[row : row + 1], prefer=prefer)
+        q, _ = fast_solver(points[row], normals[row], ar10.home if prefer == "q0" else None)
+        np.testing.assert_array_equal(q, batch.q[row])
+        single_batch = solver.solve_batch(
+            points[row : row + 1], normals[row : row + 1], prefer=prefer
+        )
         for name in ("q", "status", "restarts", "iterations"):
-            assert np.array_equal(getattr(one, name)[0], getattr(many, name)[row])
-        assert {name: spent[row] for name, spent in many.phases.items()} == {
-            name: spent[0] for name, spent in one.phases.items()
+            assert np.array_equal(getattr(single_batch, name)[0], getattr(batch, name)[row])
+        assert {name: phase_times[row] for name, phase_times in batch.phases.items()} == {
+            name: phase_times[0] for name, phase_times in single_batch.phases.items()
         }

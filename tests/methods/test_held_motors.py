@@ -24,17 +24,17 @@ def all_solved(
 
 
 @pytest.mark.parametrize(
-    ("method", "limits", "least"),
+    ("method", "limits", "min_solved"),
     [("hand-first", "enforce", 1), ("hand-first", "ignore", 1), ("thumb-first", "enforce", 0.9)],
 )
-def test_every_motor_may_be_held(robot, rng, method, limits, least):
+def test_every_motor_may_be_held(robot, rng, method, limits, min_solved):
     tolerance = ik.Tolerance(1e-6, 1e-6) if method == "hand-first" else ik.Tolerance()
     solver = ik.Solver(robot, method, tolerance, limits=limits)
     for i, name in enumerate(robot.actuators):
         q = robot.random(rng, 25)
         q[:, i] = value = rng.uniform(robot.lower[i], robot.upper[i])
         batch = solver.solve_batch(*robot.contacts(q), fixed={name: value})
-        assert batch.success.mean() >= least, name
+        assert batch.success.mean() >= min_solved, name
         np.testing.assert_array_equal(batch.q[:, i], value)
 
 

@@ -25,10 +25,10 @@ trunk: planar
 sides:
   arm: {arm: ur5e, hand: panda_hand, at: {xyz: [0, 0, 0.5]}}
 """
-EVERY = ("batch", "single", "fast", "choose", "palms", "clearance")
+QUESTIONS = ("batch", "single", "fast", "choose", "palms", "clearance")
 ROBOTS = {
-    "arm": ("ur5e+tool", EVERY),
-    "hand": ("dclaw", EVERY),
+    "arm": ("ur5e+tool", QUESTIONS),
+    "hand": ("dclaw", QUESTIONS),
     "arm_and_hand": ("ur5e+panda_hand", ("batch", "single", "choose")),
     "two_arms": (PAIR, ("batch", "single", "choose", "palms")),
     "mobile_arm": (MOBILE, ("batch", "single")),
@@ -83,7 +83,7 @@ class Questions:
         """Return the answers of a choice among all grasps, in the grasps' order."""
         ranked = self.solver.choose(self.grasps, q0=self.start[0], prefer="q0")
         assert len(ranked) >= 5
-        return np.array([choice.q for choice in sorted(ranked, key=lambda one: one.candidate)])
+        return np.array([choice.q for choice in sorted(ranked, key=lambda item: item.candidate)])
 
     def palms(self) -> np.ndarray:
         """Return the answers to the palms of all sides."""
@@ -126,10 +126,10 @@ def questions(tmp_path_factory) -> Callable[[str], tuple[Questions, Questions]]:
             path.write_text(ROBOTS[name][0])
         robot, base = ik.load_robot(path), random_pose(np.random.default_rng(3))
         upright = Questions(on_pedestal(robot, folder / "upright"))
-        moved = Questions(on_pedestal(robot, folder / "moved", base))
+        moved_robot = Questions(on_pedestal(robot, folder / "moved", base))
         points = upright.points @ base[:3, :3].T + base[:3, 3]
-        np.testing.assert_allclose(moved.points, points, atol=1e-9)
-        return upright, moved
+        np.testing.assert_allclose(moved_robot.points, points, atol=1e-9)
+        return upright, moved_robot
 
     return imported
 
@@ -143,10 +143,10 @@ def questions(tmp_path_factory) -> Callable[[str], tuple[Questions, Questions]]:
     ],
 )
 def test_answers_do_not_depend_on_the_pose_of_the_base(questions, name, call):
-    answers, moved = (getattr(robot, call)() for robot in questions(name))
-    assert answers.shape == moved.shape
+    answers, moved_answers = (getattr(robot, call)() for robot in questions(name))
+    assert answers.shape == moved_answers.shape
     # Rounding decides between arms that score alike.
-    assert np.isclose(answers, moved, atol=1e-5).all(axis=1).mean() >= 0.75
+    assert np.isclose(answers, moved_answers, atol=1e-5).all(axis=1).mean() >= 0.75
 
 
 def test_two_arms_stand_on_places_of_a_moved_base(tmp_path):

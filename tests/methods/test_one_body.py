@@ -23,10 +23,10 @@ def robot(request):
     return ik.load_robot(request.param)
 
 
-def targets(robot, count, near=False, seed=0):
+def targets(robot, count, is_near_home=False, seed=0):
     rng = np.random.default_rng(seed)
     part = rng.random((count, len(robot.lower)))
-    if near:
+    if is_near_home:
         at_end = rng.random(part.shape) < 0.5
         part = np.where(at_end, np.where(part < 0.5, 0.02 * part, 1 - 0.02 * (1 - part)), part)
     q = robot.lower + part * (robot.upper - robot.lower)
@@ -42,15 +42,15 @@ def misses(robot, q, points):
     return np.linalg.norm(robot.contacts(q)[0] - points, axis=-1)
 
 
-@pytest.mark.parametrize("near", [False, True])
-def test_what_is_reachable_is_solved(robot, near):
-    _, points, normals = targets(robot, 300, near)
+@pytest.mark.parametrize("is_near_home", [False, True])
+def test_what_is_reachable_is_solved(robot, is_near_home):
+    _, points, normals = targets(robot, 300, is_near_home)
     for tolerance in (ik.Tolerance(), FINE):
-        found = ik.Solver(robot, tolerance=tolerance).solve_batch(points, normals)
-        assert np.all(found.status == ik.Status.SOLVED)
+        batch = ik.Solver(robot, tolerance=tolerance).solve_batch(points, normals)
+        assert np.all(batch.status == ik.Status.SOLVED)
         # By the robot itself, whatever the solver says.
-        assert misses(robot, found.q, points).max() <= tolerance.position * 1.001
-        assert np.all((found.q >= robot.lower - 1e-9) & (found.q <= robot.upper + 1e-9))
+        assert misses(robot, batch.q, points).max() <= tolerance.position * 1.001
+        assert np.all((batch.q >= robot.lower - 1e-9) & (batch.q <= robot.upper + 1e-9))
 
 
 def test_a_log_has_singular_values_by_side(tmp_path: Path):
@@ -75,13 +75,13 @@ def test_a_log_has_singular_values_by_side(tmp_path: Path):
 
 def test_a_hand_without_contacts_stays(robot):
     body = robot.description
-    side, others = body.sides[0], body.sides[1:]
+    side, other_sides = body.sides[0], body.sides[1:]
     q = targets(robot, 1)[0][0]
-    found = ik.Solver(robot).solve(grasp(robot, q, side.fingers))
-    assert found.status == ik.Status.SOLVED
-    for other in others:
-        rest = [body.actuator_index(motor) for motor in (*other.arm, *other.hand)]
-        np.testing.assert_array_equal(found.q[rest], robot.home[rest])
+    solution = ik.Solver(robot).solve(grasp(robot, q, side.fingers))
+    assert solution.status == ik.Status.SOLVED
+    for other_side in other_sides:
+        motors = [body.actuator_index(motor) for motor in (*other_side.arm, *other_side.hand)]
+        np.testing.assert_array_equal(solution.q[motors], robot.home[motors])
 
 
 def test_what_is_near_is_preferred(robot):
@@ -90,55 +90,55 @@ def test_what_is_near_is_preferred(robot):
     q = robot.lower + (0.3 + 0.4 * rng.random(len(span))) * span
     start = np.clip(q + 0.01 * span * rng.standard_normal(len(q)), robot.lower, robot.upper)
     solver = ik.Solver(robot, tolerance=FINE)
-    near = solver.solve(grasp(robot, q), q0=start, prefer="q0")
-    assert near.status == ik.Status.SOLVED
-    assert (np.abs(near.q - start) / span).max() < 0.2
+    near_solution = solver.solve(grasp(robot, q), q0=start, prefer="q0")
+    assert near_solution.status == ik.Status.SOLVED
+    assert (np.abs(near_solution.q - start) / span).max() < 0.2
 
 
 @pytest.mark.parametrize("name", ["two_pandas+allegro", "g1+dex3"])
 def test_what_touches_nothing_is_found(name):
     """Fingers of a hand touch each other, arms each other, and a hand the body."""
     robot = ik.load_robot(name)
-    solver, about, kept = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home), []
+    solver, any_grasp, q_touching = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home), []
     for seed in range(30):
-        some = robot.random(np.random.default_rng(seed), 1000)
-        kept += list(some[solver.check(some, about).distance > 1e-4])
-        if len(kept) >= 20:
+        samples = robot.random(np.random.default_rng(seed), 1000)
+        q_touching += list(samples[solver.check(samples, any_grasp).distance > 1e-4])
+        if len(q_touching) >= 20:
             break
-    points, normals = robot.contacts(np.array(kept[:20]))
-    found = solver.solve_batch(points, normals)
-    assert (found.status == ik.Status.SOLVED).mean() >= 0.95
-    solved = found.success
-    assert (solver.check(found.q[solved], about).distance >= 0).all()
-    assert misses(robot, found.q, points)[solved].max() <= 5e-3 * 1.001
+    points, normals = robot.contacts(np.array(q_touching[:20]))
+    batch = solver.solve_batch(points, normals)
+    assert (batch.status == ik.Status.SOLVED).mean() >= 0.95
+    solved = batch.success
+    assert (solver.check(batch.q[solved], any_grasp).distance >= 0).all()
+    assert misses(robot, batch.q, points)[solved].max() <= 5e-3 * 1.001
     # Few of them come by themselves.
     first = ik.Solver(robot).solve_batch(points, normals).q
-    assert (solver.check(first, about).distance < 0).mean() > 0.1
+    assert (solver.check(first, any_grasp).distance < 0).mean() > 0.1
 
 
 def test_hands_that_touch_themselves_are_moved_within_tolerances():
     """Of contacts of random postures, most of which touch something, many can be met freely."""
     robot = ik.load_robot("g1+dex3")
-    solver, about = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home)
+    solver, any_grasp = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home)
     q = robot.random(np.random.default_rng(0), 40)
     points, normals = robot.contacts(q)
-    found = solver.solve_batch(points, normals)
-    assert found.success.sum() >= 8
-    assert (solver.check(found.q, about).distance >= 0)[found.success].all()
-    assert misses(robot, found.q, points)[found.success].max() <= 5e-3 * 1.001
+    batch = solver.solve_batch(points, normals)
+    assert batch.success.sum() >= 8
+    assert (solver.check(batch.q, any_grasp).distance >= 0)[batch.success].all()
+    assert misses(robot, batch.q, points)[batch.success].max() <= 5e-3 * 1.001
 
 
 def test_manipulability_is_that_of_the_worst_arm(robot):
     q = targets(robot, 1)[0][0]
-    found = ik.Solver(robot).solve_all(grasp(robot, q), limit=3, prefer="manipulability")
-    scores = [one.manipulability for one in found]
+    solutions = ik.Solver(robot).solve_all(grasp(robot, q), limit=3, prefer="manipulability")
+    scores = [solution.manipulability for solution in solutions]
     assert scores == sorted(scores, reverse=True)
     assert scores[-1] > 0
-    for one in found:
+    for solution in solutions:
         arms = [robot.description.side_actuators[i][0] for i in range(len(robot.sides))]
-        assert one.manipulability == pytest.approx(
+        assert solution.manipulability == pytest.approx(
             min(
-                measure(robot, one.q, side, arm)
+                measure(robot, solution.q, side, arm)
                 for side, arm in zip(robot.sides, arms, strict=True)
             ),
             rel=1e-3,
@@ -147,12 +147,12 @@ def test_manipulability_is_that_of_the_worst_arm(robot):
 
 def measure(robot, q, side, arm):
     """Yoshikawa's measure of a side's arm, its Jacobian by differences of palms."""
-    here, step, columns = robot.palm(q, side), 1e-6, []
+    pose, step, columns = robot.palm(q, side), 1e-6, []
     for motor in arm:
-        there = robot.palm(np.where(np.arange(len(q)) == motor, q + step, q), side)
-        turned = (there[:3, :3] - here[:3, :3]) @ here[:3, :3].T / step
-        turn = [turned[2, 1], turned[0, 2], turned[1, 0]]
-        columns.append([*((there[:3, 3] - here[:3, 3]) / step), *turn])
+        pose_after = robot.palm(np.where(np.arange(len(q)) == motor, q + step, q), side)
+        rotation_rate = (pose_after[:3, :3] - pose[:3, :3]) @ pose[:3, :3].T / step
+        turn = [rotation_rate[2, 1], rotation_rate[0, 2], rotation_rate[1, 0]]
+        columns.append([*((pose_after[:3, 3] - pose[:3, 3]) / step), *turn])
     return np.prod(np.linalg.svd(np.array(columns), compute_uv=False)[:6])
 
 
@@ -160,10 +160,10 @@ def test_motors_are_held(robot):
     q = targets(robot, 1, seed=3)[0][0]
     names = [*robot.description.trunk, robot.description.sides[0].hand[0]]
     fixed = {name: float(q[robot.description.actuator_index(name)]) for name in names}
-    found = ik.Solver(robot).solve(grasp(robot, q), fixed=fixed)
-    assert found.status == ik.Status.SOLVED
+    solution = ik.Solver(robot).solve(grasp(robot, q), fixed=fixed)
+    assert solution.status == ik.Status.SOLVED
     for name, value in fixed.items():
-        assert found.q[robot.description.actuator_index(name)] == pytest.approx(value, abs=1e-12)
+        assert solution.q[robot.description.actuator_index(name)] == pytest.approx(value, abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ["g1+dex3", "h1_2+inspire"])
@@ -173,54 +173,54 @@ def test_what_is_just_out_of_reach_is_given_up_soon(name):
     _, points, normals = targets(robot, 4)
     solver, out = ik.Solver(robot), points[:, side].mean(axis=1)
     out /= np.linalg.norm(out, axis=1)[:, None]
-    while (found := solver.solve_batch(points, normals)).success.any():
-        points[np.ix_(found.success, side)] += 0.05 * out[found.success, None]
+    while (batch := solver.solve_batch(points, normals)).success.any():
+        points[np.ix_(batch.success, side)] += 0.05 * out[batch.success, None]
     # Each trunk takes about 30; before 300,000 was the rule.
-    assert np.median(found.iterations) < 150_000
+    assert np.median(batch.iterations) < 150_000
 
 
 def test_what_is_far_away_is_given_up_at_once(robot):
     """Also where contacts leave palms a freedom, and of one arm on a trunk."""
     _, points, normals = targets(robot, 4)
-    found = ik.Solver(robot).solve_batch(points + np.array([3.0, 0.0, 0.0]), normals)
+    batch = ik.Solver(robot).solve_batch(points + np.array([3.0, 0.0, 0.0]), normals)
     # All trunks and rounds took two Pandas 158,000 before.
-    assert found.iterations.max() < 120_000
+    assert batch.iterations.max() < 120_000
 
 
 def test_what_is_out_of_reach_is_told(robot):
     q = targets(robot, 1)[0][0]
-    far = {
+    far_contacts = {
         finger: ik.Contact(np.asarray(contact.point) + 5.0, contact.normal)
         for finger, contact in grasp(robot, q).contacts.items()
     }
-    found = ik.Solver(robot).solve(ik.Grasp(name="far", contacts=far))
-    assert found.status != ik.Status.SOLVED
-    assert found.diagnosis is not None
-    assert set(found.diagnosis.sides) == set(robot.sides)
-    assert not any(worst.ok for worst in found.diagnosis.sides.values())
+    solution = ik.Solver(robot).solve(ik.Grasp(name="far", contacts=far_contacts))
+    assert solution.status != ik.Status.SOLVED
+    assert solution.diagnosis is not None
+    assert set(solution.diagnosis.sides) == set(robot.sides)
+    assert not any(worst.ok for worst in solution.diagnosis.sides.values())
 
 
 def test_the_side_that_cannot_is_named():
     robot = ik.load_robot("g1+dex3")
-    asked = grasp(robot, robot.home).contacts
-    far = {
+    contacts = grasp(robot, robot.home).contacts
+    far_contacts = {
         finger: ik.Contact(np.add(contact.point, [0, 2.0, 0]), contact.normal)
-        for finger, contact in asked.items()
+        for finger, contact in contacts.items()
         if finger.startswith("left")
     }
-    found = ik.Solver(robot).solve(ik.Grasp(name="far", contacts={**asked, **far}))
-    assert found.status == ik.Status.UNREACHABLE
-    sides = found.diagnosis.sides
+    solution = ik.Solver(robot).solve(ik.Grasp(name="far", contacts={**contacts, **far_contacts}))
+    assert solution.status == ik.Status.UNREACHABLE
+    sides = solution.diagnosis.sides
     assert sides["right"].ok
     assert sides["left"].position_error > 1.0
-    assert any(line.startswith("left by itself: ") for line in found.diagnosis.lines)
+    assert any(line.startswith("left by itself: ") for line in solution.diagnosis.lines)
 
 
 def test_without_a_compiler_there_is_an_answer():
     robot = ik.load_robot("mobile_kuka_lwr_barrett")
     q = robot.lower + 0.4 * (robot.upper - robot.lower)
-    found = ik.Solver(robot, compiled=False).solve(grasp(robot, q), q0=q + 0.02)
-    assert found.status == ik.Status.SOLVED
+    solution = ik.Solver(robot, compiled=False).solve(grasp(robot, q), q0=q + 0.02)
+    assert solution.status == ik.Status.SOLVED
 
 
 @pytest.mark.parametrize("method", sorted({*ik.METHODS} - {"hand-first", "ipopt"}))
@@ -230,52 +230,58 @@ def test_the_papers_methods_say_what_they_need(method):
 
 
 def palm_grasp(robot, q, sides):
-    own = {side.name: side.hand for side in robot.description.sides}
+    motors_of_side = {side.name: side.hand for side in robot.description.sides}
     return ik.Grasp(
         palm={side: robot.palm(q, side) for side in sides},
-        posture={name: q[robot.actuators.index(name)] for side in sides for name in own[side]},
+        posture={
+            name: q[robot.actuators.index(name)] for side in sides for name in motors_of_side[side]
+        },
     )
 
 
 def test_palms_are_given_by_side(robot):
     q = robot.random(np.random.default_rng(5), 1)[0]
     sides = [side.name for side in robot.description.sides]
-    found = ik.Solver(robot).solve(palm_grasp(robot, q, sides))
-    assert found.success
+    solution = ik.Solver(robot).solve(palm_grasp(robot, q, sides))
+    assert solution.success
     for side in sides:
-        off = robot.palm(found.q, side)[:3] - robot.palm(q, side)[:3]
+        off = robot.palm(solution.q, side)[:3] - robot.palm(q, side)[:3]
         assert np.abs(off[:, 3]).max() < 6e-3
         assert np.abs(off[:, :3]).max() < 0.3
     hands = [robot.actuators.index(m) for side in robot.description.sides for m in side.hand]
-    assert np.allclose(found.q[hands], q[hands])
+    assert np.allclose(solution.q[hands], q[hands])
     if len(sides) == 1:
-        alone = ik.Grasp(palm=robot.palm(q), posture=palm_grasp(robot, q, sides).posture)
-        np.testing.assert_array_equal(ik.Solver(robot).solve(alone).q, found.q)
+        palm_only = ik.Grasp(palm=robot.palm(q), posture=palm_grasp(robot, q, sides).posture)
+        np.testing.assert_array_equal(ik.Solver(robot).solve(palm_only).q, solution.q)
 
 
 def test_one_palm_alone_leaves_the_other_arm():
     robot = ik.load_robot("g1+dex3")
     q = robot.home + 0.02
-    found = ik.Solver(robot).solve(palm_grasp(robot, q, ["left"]), q0=robot.home)
-    assert found.success
+    solution = ik.Solver(robot).solve(palm_grasp(robot, q, ["left"]), q0=robot.home)
+    assert solution.success
     right = [i for i, name in enumerate(robot.actuators) if "right" in name]
-    assert np.allclose(found.q[right], robot.home[right])
+    assert np.allclose(solution.q[right], robot.home[right])
 
 
 def test_palms_that_cannot_be_are_refused():
     robot = ik.load_robot("g1+dex3")
-    solver, one = ik.Solver(robot), palm_grasp(robot, robot.home, ["left"])
+    solver, palm_of_left = ik.Solver(robot), palm_grasp(robot, robot.home, ["left"])
     with pytest.raises(ik.errors.InputError, match=r"palm\.middle:.*side.*left"):
-        solver.solve(ik.Grasp(palm={"middle": np.eye(4)}, posture=one.posture))
+        solver.solve(ik.Grasp(palm={"middle": np.eye(4)}, posture=palm_of_left.posture))
     with pytest.raises(
         ik.errors.InputError,
         match=r"one pose, expected one by side \(palms in a file\): left, right",
     ):
-        solver.solve(ik.Grasp(palm=np.eye(4), posture=one.posture))
+        solver.solve(ik.Grasp(palm=np.eye(4), posture=palm_of_left.posture))
     with pytest.raises(ik.errors.InputError, match=r"posture\..*: "):
-        solver.solve(ik.Grasp(palm=one.palm, posture={**one.posture, "waist_yaw_joint": 0.0}))
+        solver.solve(
+            ik.Grasp(
+                palm=palm_of_left.palm, posture={**palm_of_left.posture, "waist_yaw_joint": 0.0}
+            )
+        )
     with pytest.raises(ik.errors.InputError, match=r"palm\.left: .*3.*8"):
-        ik.Grasp(palm={"left": 2 * np.eye(4)}, posture=one.posture)
+        ik.Grasp(palm={"left": 2 * np.eye(4)}, posture=palm_of_left.posture)
     with pytest.raises(ik.errors.InputError, match=r"side:.*None"):
         robot.palm(robot.home)
 
@@ -293,22 +299,22 @@ def test_an_object_is_found_where_both_hands_reach_it():
     low, high = middle - np.array([0.3, 0.3, 0.3]), middle + np.array([0.4, 0.2, 0.3])
     within = ik.Free([*low, 0.0, 0.0, -2.0], [*high, 0.0, 0.0, 2.0])
     free = ik.Grasp(box.contacts, object_pose=within)
-    found = ik.Solver(robot).solve(free)
-    assert found.success
-    pose = found.object_pose
+    solution = ik.Solver(robot).solve(free)
+    assert solution.success
+    pose = solution.object_pose
     assert np.all(pose[:3, 3] >= low)
     assert np.all(pose[:3, 3] <= high)
     points, _ = box.at(pose).arrays(robot.fingers)
-    assert misses(robot, found.q, points).max() <= 5e-3
+    assert misses(robot, solution.q, points).max() <= 5e-3
 
 
 def test_an_object_that_nobody_reaches_is_told():
     robot = ik.load_robot("g1+dex3")
     box, _ = held_box(robot)
-    far = ik.Free([3, 0, 0, 0, 0, 0], [4, 1, 1, 0, 0, 1])
-    found = ik.Solver(robot).solve(ik.Grasp(box.contacts, object_pose=far))
-    assert found.status is ik.Status.UNREACHABLE
-    assert np.allclose(found.object_pose[:3, 3], [3.5, 0.5, 0.5])
+    far_pose = ik.Free([3, 0, 0, 0, 0, 0], [4, 1, 1, 0, 0, 1])
+    solution = ik.Solver(robot).solve(ik.Grasp(box.contacts, object_pose=far_pose))
+    assert solution.status is ik.Status.UNREACHABLE
+    assert np.allclose(solution.object_pose[:3, 3], [3.5, 0.5, 0.5])
 
 
 def test_bounds_of_an_object_that_cannot_be_are_refused():
@@ -337,43 +343,43 @@ def test_hands_come_close_and_lift_together(sides):
     pytest.importorskip("toppra")
     robot = ik.load_robot("g1+dex3")
     fingers = [name for name in robot.fingers if name.startswith(sides)]
-    asked = grasp(robot, near_home(robot), fingers)
-    found = ik.Solver(robot).reach(asked, opening=0.01, distance=0.05, lift=0.1)
-    assert found.success
-    q, parts = found.motion.q, found.motion.notes["part"]
+    grasp_near_home = grasp(robot, near_home(robot), fingers)
+    motion = ik.Solver(robot).reach(grasp_near_home, opening=0.01, distance=0.05, lift=0.1)
+    assert motion.success
+    q, parts = motion.motion.q, motion.motion.notes["part"]
     rows = [robot.fingers.index(name) for name in fingers]
     tips = robot.contacts(q)[0]
-    there = np.array([asked.contacts[name].point for name in fingers])
-    assert np.allclose(tips[-1][rows], there + np.array([0, 0, 0.1]), atol=2e-3)
+    points = np.array([grasp_near_home.contacts[name].point for name in fingers])
+    assert np.allclose(tips[-1][rows], points + np.array([0, 0, 0.1]), atol=2e-3)
     # What both hold keeps its place in both hands while it is lifted.
-    held = tips[parts == "lifting"][:, rows]
-    assert np.abs(held - held[:, :1] - (there - there[0])).max() < 2e-3
-    came = tips[parts == "coming"][0][rows] - there
+    lifted_tips = tips[parts == "lifting"][:, rows]
+    assert np.abs(lifted_tips - lifted_tips[:, :1] - (points - points[0])).max() < 2e-3
+    came = tips[parts == "coming"][0][rows] - points
     assert np.linalg.norm(came, axis=1).min() > 0.04
 
 
 def test_a_body_is_drawn(tmp_path):
     robot = ik.load_robot("g1+dex3")
-    asked = grasp(robot, robot.home)
-    answer = ik.Solver(robot).solve(asked)
-    answer.draw(asked, tmp_path / "g1.png")
+    grasp_at_home = grasp(robot, robot.home)
+    answer = ik.Solver(robot).solve(grasp_at_home)
+    answer.draw(grasp_at_home, tmp_path / "g1.png")
     assert (tmp_path / "g1.png").stat().st_size > 20_000
 
 
-@pytest.mark.parametrize("what", ["solve_palms", "grasps_of", "place"])
-def test_what_needs_one_hand_says_so(what):
+@pytest.mark.parametrize("call", ["solve_palms", "grasps_of", "place"])
+def test_what_needs_one_hand_says_so(call):
     solver = ik.Solver(ik.load_robot("g1+dex3"))
     q, pose = solver.robot.home, np.eye(4)
     calls = {
         "solve_palms": lambda: solver.solve_palms(pose[None], q),
         "grasps_of": lambda: solver.grasps_of(ik.load_surface("tennis_ball"), pose),
     }
-    if what == "place":
+    if call == "place":
         contacts = grasp_at(solver.robot, q).contacts
-        held = solver.choose([ik.Grasp(contacts, object_pose=pose)])[0]
-        calls[what] = lambda: solver.place(held, pose, q)
-    with pytest.raises(ik.errors.UnsupportedError, match=f"^{what} {ONE_HAND}"):
-        calls[what]()
+        choice = solver.choose([ik.Grasp(contacts, object_pose=pose)])[0]
+        calls[call] = lambda: solver.place(choice, pose, q)
+    with pytest.raises(ik.errors.UnsupportedError, match=f"^{call} {ONE_HAND}"):
+        calls[call]()
 
 
 def test_a_side_by_itself_is_an_arm_hand():
@@ -383,11 +389,11 @@ def test_a_side_by_itself_is_an_arm_hand():
     assert side.sides == ()
     assert set(body.trunk) < set(side.actuators)
     q = body.random(np.random.default_rng(2), 20)
-    own = q[:, [body.actuators.index(motor) for motor in side.actuators]]
-    np.testing.assert_allclose(side.palm(own), body.palm(q, name), atol=1e-12)
-    np.testing.assert_allclose(side.contacts(own)[0], body.contacts(q)[0], atol=1e-12)
-    found = ik.Solver(side).solve_palms(side.palm(own), own)
-    assert found.success.all()
+    q_side = q[:, [body.actuators.index(motor) for motor in side.actuators]]
+    np.testing.assert_allclose(side.palm(q_side), body.palm(q, name), atol=1e-12)
+    np.testing.assert_allclose(side.contacts(q_side)[0], body.contacts(q)[0], atol=1e-12)
+    batch = ik.Solver(side).solve_palms(side.palm(q_side), q_side)
+    assert batch.success.all()
     with pytest.raises(ik.errors.UnknownNameError, match=r"'middle'.*sides: "):
         body.side("middle")
 

@@ -38,9 +38,9 @@ def test_all_are_solved_and_every_answer_is_right(name, sampler, count, fingers,
     points[:, free] = normals[:, free] = np.nan
     batch = ik.Solver(robot, tolerance=ik.Tolerance(*tolerance)).solve_batch(points, normals)
     assert np.flatnonzero(~batch.success).tolist() == []
-    reached, faced = numpy_oracle.contacts(robot, batch.q)
+    points_reached, faced = numpy_oracle.contacts(robot, batch.q)
     # Rounding: of two kinds of arithmetic over a chain of a metre, and of the verdict's own slack.
-    distance = np.linalg.norm(reached - points, axis=2)
+    distance = np.linalg.norm(points_reached - points, axis=2)
     np.testing.assert_array_equal(np.isnan(distance), np.tile(free, (count, 1)))
     assert np.nanmax(distance) <= tolerance[0] * (1 + 1e-6)
     chord = np.linalg.norm(faced - normals, axis=2)

@@ -29,7 +29,7 @@ def solver(robot) -> ik.Solver:
 
 
 @pytest.fixture(scope="module")
-def once(robot) -> ik.Solver:
+def single_start(robot) -> ik.Solver:
     return thumb_first(robot, starts=1)
 
 
@@ -42,15 +42,15 @@ def bent(robot, rng, count):
 
 
 @pytest.mark.parametrize("hands", [shipped_hands, bent])
-def test_one_start_is_nearly_always_enough(robot, once, rng, hands):
-    batch = once.solve_batch(*robot.contacts(hands(robot, rng, 600)))
+def test_one_start_is_nearly_always_enough(robot, single_start, rng, hands):
+    batch = single_start.solve_batch(*robot.contacts(hands(robot, rng, 600)))
     assert batch.success.mean() >= 0.995
     assert batch.limits_ok.all()
     assert not batch.restarts.any()
 
 
 @pytest.mark.parametrize(
-    ("hands", "tolerance", "least"),
+    ("hands", "tolerance", "min_solved"),
     [
         *((hands, tolerance, 1) for hands in (shipped_hands, bent) for tolerance in (PAPER, EXACT)),
         # Hands that are no grasps.
@@ -58,10 +58,10 @@ def test_one_start_is_nearly_always_enough(robot, once, rng, hands):
         (ik.ArmHand.random, EXACT, 0.98),
     ],
 )
-def test_other_starts_do_the_rest(robot, rng, hands, tolerance, least):
+def test_other_starts_do_the_rest(robot, rng, hands, tolerance, min_solved):
     solver = thumb_first(robot, tolerance)
     batch = solver.solve_batch(*robot.contacts(hands(robot, rng, 300)))
-    assert batch.success.mean() >= least
+    assert batch.success.mean() >= min_solved
 
 
 def test_limits_ignored(robot, rng):
@@ -74,18 +74,20 @@ def test_the_nearest_of_what_is_seen(robot, solver, rng):
     """It moved as far as without a start, and from some solved nothing."""
     q, q0 = robot.random(rng, 400), robot.random(rng, 400)
     targets = robot.contacts(q)
-    near = solver.solve_batch(*targets, q0=q0)
-    far = solver.solve_batch(*targets, q0=q0, prefer="limits")
-    assert near.success.all()
-    assert far.success.mean() > 0.995
-    np.testing.assert_array_equal(far.q, solver.solve_batch(*targets).q)
+    near_batch = solver.solve_batch(*targets, q0=q0)
+    limits_batch = solver.solve_batch(*targets, q0=q0, prefer="limits")
+    assert near_batch.success.all()
+    assert limits_batch.success.mean() > 0.995
+    np.testing.assert_array_equal(limits_batch.q, solver.solve_batch(*targets).q)
     ranges = robot.upper - robot.lower
-    moved = [np.linalg.norm((batch.q - q0) / ranges, axis=1) for batch in (near, far)]
-    assert (moved[0] <= moved[1]).mean() > 0.9
+    distances = [
+        np.linalg.norm((batch.q - q0) / ranges, axis=1) for batch in (near_batch, limits_batch)
+    ]
+    assert (distances[0] <= distances[1]).mean() > 0.9
     close = np.clip(q + rng.uniform(-0.02, 0.02, q.shape) * ranges, robot.lower, robot.upper)
-    followed = solver.solve_batch(*targets, q0=close)
-    assert followed.success.all()
-    assert np.median(np.abs((followed.q - close) / ranges).max(axis=1)) < 0.05
+    close_batch = solver.solve_batch(*targets, q0=close)
+    assert close_batch.success.all()
+    assert np.median(np.abs((close_batch.q - close) / ranges).max(axis=1)) < 0.05
 
 
 def test_contacts_that_contradict_each_other_a_little_are_balanced(robot, solver, rng):
@@ -108,12 +110,12 @@ def test_out_of_reach_the_best_is_kept(robot, solver, rng):
     assert batch.limits_ok.all()
 
 
-def test_the_start_chooses_between_hands(robot, once, rng):
+def test_the_start_chooses_between_hands(robot, single_start, rng):
     """Of several hands for the same contacts, the one near q0 is begun with."""
     q = robot.random(rng, 200)
     around = np.clip(q + rng.normal(0, 0.3, q.shape), robot.lower, robot.upper)
     starts = (robot.home, around)
-    batches = [once.solve_batch(*robot.contacts(q), q0=q0, prefer="q0") for q0 in starts]
+    batches = [single_start.solve_batch(*robot.contacts(q), q0=q0, prefer="q0") for q0 in starts]
     hand = list(robot.description.hand_actuators)
     from_home, from_truth = (np.abs(batch.q - q)[:, hand].max(axis=1) for batch in batches)
     assert np.median(from_truth) < np.median(from_home)
@@ -126,14 +128,14 @@ def test_without_an_arm_the_palm_is_fixed(coupled_robot, rng):
     assert not batch.phases["arm-placement"].any()
 
 
-def test_proxqp_solves_as_well(robot, once, rng):
+def test_proxqp_solves_as_well(robot, single_start, rng):
     """The quadratic program takes the same way: nothing is lost by fixing joints one by one."""
     targets = robot.contacts(shipped_hands(robot, rng, 60))
     program = thumb_first(robot, starts=1, step="proxqp")
-    one, other = once.solve_batch(*targets), program.solve_batch(*targets)
-    np.testing.assert_array_equal(one.success, other.success)
-    assert other.limits_ok.all()
-    assert np.mean(one.iterations == other.iterations) > 0.8
+    single_batch, program_batch = single_start.solve_batch(*targets), program.solve_batch(*targets)
+    np.testing.assert_array_equal(single_batch.success, program_batch.success)
+    assert program_batch.limits_ok.all()
+    assert np.mean(single_batch.iterations == program_batch.iterations) > 0.8
 
 
 @pytest.mark.parametrize("joints", [1, 3, 4])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from robot_variants import with_fixed_motor
-from toy_robots import moved
+from toy_robots import moved_targets
 
 import casadi_ik as ik
 from casadi_ik.compile.emitter import CodeOptions
@@ -21,7 +21,7 @@ def test_displaced_targets_are_solved_in_a_batch(robot, degrees, prefer):
     tolerance = ik.Tolerance(0.005, np.radians(degrees))
     rng = np.random.default_rng(7)
     contacts = robot.contacts(robot.random(rng, 500))
-    points, normals = moved(contacts, rng, 0.8 * tolerance.position, 0.8 * tolerance.angle)
+    points, normals = moved_targets(contacts, rng, 0.8 * tolerance.position, 0.8 * tolerance.angle)
     starts = robot.random(np.random.default_rng(1), len(points))
     batch = ik.Solver(robot, tolerance=tolerance).solve_batch(
         points, normals, q0=starts, prefer=prefer
@@ -35,7 +35,7 @@ def test_wide_tolerances_are_searched_beyond_the_minima_of_exact_fits(name):
     robot, rng = ik.load_robot(name), np.random.default_rng(5)
     tolerance = ik.Tolerance(0.001, np.radians(60.0))
     contacts = robot.contacts(robot.random(rng, 1000))
-    targets = moved(contacts, rng, 0.8 * tolerance.position, 0.8 * tolerance.angle)
+    targets = moved_targets(contacts, rng, 0.8 * tolerance.position, 0.8 * tolerance.angle)
     with pytest.warns(ik.errors.InputWarning, match="tolerance"):
         solver = ik.Solver(robot, tolerance=tolerance)
     assert np.mean(solver.solve_batch(*targets).success) >= 0.997

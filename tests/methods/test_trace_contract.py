@@ -20,9 +20,9 @@ from trace_checks import (
     COST,
     DAMPING,
     RESTART,
-    Kept,
     Layout,
     SolveBlock,
+    TraceRecorder,
     check_trace,
 )
 
@@ -49,24 +49,27 @@ def run(robot: ik.ArmHand, method: str) -> SolveBlock:
     rng = np.random.default_rng(12)
     grasps = random_arm_targets(robot, ("cup", "mug"), 4, rng)
     # The original methods converge from next to the target only.
-    near = robot.home + rng.normal(size=(4, len(robot.home))) * [[0.02], [0.02], [1e-3], [1e-3]]
+    q_near = robot.home + rng.normal(size=(4, len(robot.home))) * [[0.02], [0.02], [1e-3], [1e-3]]
     hard = (random_hands, near_limits_on_aligned_arms, aligned_arms)
-    q = [np.clip(near, robot.lower, robot.upper), *(draw(robot, rng, 6) for draw in hard)]
+    q = [np.clip(q_near, robot.lower, robot.upper), *(draw(robot, rng, 6) for draw in hard)]
     points, normals = (
         np.concatenate([first, second])
         for first, second in zip(grasps, robot.contacts(np.concatenate(q)), strict=True)
     )
     points[-2:] += np.array([0.6, 0.0, 0.0])
-    kept, options = Kept(), METHODS[method][1]
-    known = {name: value for name, value in options.items() if name != "finger_step"}
+    recorder, options = TraceRecorder(), METHODS[method][1]
+    options_of_method = {name: value for name, value in options.items() if name != "finger_step"}
     solver = ik.Solver(
-        robot, method, options=known, finger_step=options.get("finger_step", "closed-form")
+        robot,
+        method,
+        options=options_of_method,
+        finger_step=options.get("finger_step", "closed-form"),
     )
-    solver.solve_batch(points, normals, seed=3, log=kept)
-    return joined(kept.blocks)
+    solver.solve_batch(points, normals, seed=3, log=recorder)
+    return join_blocks(recorder.blocks)
 
 
-def joined(blocks: list[SolveBlock]) -> SolveBlock:
+def join_blocks(blocks: list[SolveBlock]) -> SolveBlock:
     """Blocks of one method as one."""
     return dataclasses.replace(
         blocks[0],
@@ -95,8 +98,10 @@ def test_every_method_is_here():
 @pytest.mark.parametrize("method", METHODS)
 def test_a_method_records_the_standard_fields(blocks, method):
     names = {field.name for field in REQUIRED | METHODS[method][0]}
-    found = set(blocks[method].format.layout.names) & {field.name for field in STANDARD_FIELDS}
-    assert found == names
+    field_names = set(blocks[method].format.layout.names) & {
+        field.name for field in STANDARD_FIELDS
+    }
+    assert field_names == names
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -125,30 +130,32 @@ def test_a_field_that_is_zero_is_noticed(robot, blocks, method, field):
 @pytest.mark.parametrize("field", STANDARD_FIELDS, ids=lambda field: field.name)
 def test_a_field_of_another_kind_is_refused(robot, blocks, field):
     layout = blocks["thumb-first"].format.layout
-    other = "u1" if field.dtype != "u1" else "f8"
+    wrong_dtype = "u1" if field.dtype != "u1" else "f8"
     changed = Layout.record(
-        *(dataclasses.replace(f, dtype=other) if f.name == field.name else f for f in layout)
+        *(dataclasses.replace(f, dtype=wrong_dtype) if f.name == field.name else f for f in layout)
     )
-    with pytest.raises(ik.errors.InputError, match=rf"{field.name!r}.*{other!r}"):
+    with pytest.raises(ik.errors.InputError, match=rf"{field.name!r}.*{wrong_dtype!r}"):
         trace_format(changed, robot.description)
-    without = Layout(tuple(f for f in layout if f.name != field.name))
+    layout_without = Layout(tuple(f for f in layout if f.name != field.name))
     if field.required:
         with pytest.raises(ik.errors.InputError, match=rf"{field.name!r}"):
-            trace_format(without, robot.description)
+            trace_format(layout_without, robot.description)
     else:
-        assert field.name not in trace_format(without, robot.description).labels
+        assert field.name not in trace_format(layout_without, robot.description).labels
 
 
 def test_every_kind_of_event_is_produced(blocks):
     """Each kind by some method: names that differ between methods and events would hide one."""
-    found = {}
+    event_counts = {}
     for method, block in blocks.items():
         events = logs.detect_events(block.format, block.rows, block.batch.iterations)
-        found[method] = {logs.EventKind(kind) for kind in np.unique(events["kind"])}
+        event_counts[method] = {logs.EventKind(kind) for kind in np.unique(events["kind"])}
     # Collisions are of a log with a scene: tests/logs/test_log_collisions.py.
     with_scene = {logs.EventKind.COLLISION_ENTERED, logs.EventKind.COLLISION_LEFT}
-    assert set.union(*found.values()) == set(logs.EventKind) - with_scene
-    assert {logs.EventKind.ACTIVATED, logs.EventKind.RELEASED, logs.EventKind.RESTART} <= found[
-        "thumb-first"
-    ]
-    assert logs.EventKind.RESTART in found["hand-first"] & found["ipopt"]
+    assert set.union(*event_counts.values()) == set(logs.EventKind) - with_scene
+    assert {
+        logs.EventKind.ACTIVATED,
+        logs.EventKind.RELEASED,
+        logs.EventKind.RESTART,
+    } <= event_counts["thumb-first"]
+    assert logs.EventKind.RESTART in event_counts["hand-first"] & event_counts["ipopt"]

@@ -33,7 +33,7 @@ def solver(robot) -> ik.Solver:
     return ik.Solver(robot)
 
 
-def moved(robot: ik.ArmHand, joint: int, start: float, step: float) -> tuple:
+def target_after_step(robot: ik.ArmHand, joint: int, start: float, step: float) -> tuple:
     """Return q with a joint at an angle, and q with the joint turned on by a step."""
     q = robot.home.copy()
     q[:6] = Q
@@ -62,7 +62,7 @@ def answers(solver: ik.Solver, q0: np.ndarray, goal: np.ndarray) -> dict:
 @pytest.mark.parametrize("joint", [BASE, WRIST])
 @pytest.mark.parametrize("start", [6.2, -6.2, 9.5, -31.0])
 def test_the_answer_of_a_joint_without_limits_is_in_the_nearest_turn(solver, joint, start):
-    q0, goal = moved(solver.robot, joint, start, np.copysign(0.25, start))
+    q0, goal = target_after_step(solver.robot, joint, start, np.copysign(0.25, start))
     for call, q in answers(solver, q0, goal).items():
         assert q[joint] == pytest.approx(goal[joint], abs=0.05), call
         assert solver.robot.beyond_limits(q) <= 1e-9, call
@@ -70,24 +70,24 @@ def test_the_answer_of_a_joint_without_limits_is_in_the_nearest_turn(solver, joi
 
 @pytest.mark.parametrize(("start", "step", "end"), [(6.0, 0.2, 6.2), (6.1, 0.4, 6.5 - TURN)])
 def test_the_answer_of_a_joint_with_limits_is_in_the_nearest_turn_within(solver, start, step, end):
-    q0, goal = moved(solver.robot, SHOULDER, start, step)
+    q0, goal = target_after_step(solver.robot, SHOULDER, start, step)
     for call, q in answers(solver, q0, goal).items():
         assert q[SHOULDER] == pytest.approx(end, abs=0.05), call
         assert solver.robot.beyond_limits(q) <= 1e-9, call
 
 
 def test_a_held_joint_stays_in_its_turn(solver):
-    q0, goal = moved(solver.robot, BASE, 6.2, 0.25)
+    q0, goal = target_after_step(solver.robot, BASE, 6.2, 0.25)
     name = solver.robot.actuators[BASE]
     q0[BASE] -= 20.0
-    held = solver.solve(grasp_at(solver.robot, goal), q0=q0, fixed={name: goal[BASE]})
-    assert held.success
-    assert held.q[BASE] == pytest.approx(goal[BASE], abs=1e-12)
+    solution = solver.solve(grasp_at(solver.robot, goal), q0=q0, fixed={name: goal[BASE]})
+    assert solution.success
+    assert solution.q[BASE] == pytest.approx(goal[BASE], abs=1e-12)
 
 
 def test_a_path_of_two_turns_has_no_border(solver):
     robot = solver.robot
-    start, _ = moved(robot, BASE, 5.0, 0.0)
+    start, _ = target_after_step(robot, BASE, 5.0, 0.0)
     path = np.tile(start, (60, 1))
     path[:, BASE] += np.linspace(0, 2 * TURN, 60)
     track = solver.track(grasps_of(robot, *robot.contacts(path)), q0=start)
@@ -98,7 +98,7 @@ def test_a_path_of_two_turns_has_no_border(solver):
 
 def test_a_follower_turns_without_end(solver):
     robot = solver.robot
-    start, _ = moved(robot, BASE, 5.0, 0.0)
+    start, _ = target_after_step(robot, BASE, 5.0, 0.0)
     path = np.tile(start, (2000, 1))
     path[:, BASE] += TURN * (1 - np.cos(np.linspace(0, np.pi, 2000)))
     q, follower = start, solver.follow(q0=start, period=0.01)
@@ -110,7 +110,7 @@ def test_a_follower_turns_without_end(solver):
 
 def test_a_motion_leads_to_the_nearest_turn(solver):
     pytest.importorskip("toppra")
-    q0, goal = moved(solver.robot, BASE, 6.2, 0.25)
+    q0, goal = target_after_step(solver.robot, BASE, 6.2, 0.25)
     motion = solver.reach(grasp_at(solver.robot, goal), q0=q0, distance=0.02).motion
     assert np.ptp(motion.q[:, BASE]) < 0.6
     assert motion.q[-1, BASE] == pytest.approx(goal[BASE], abs=0.05)

@@ -39,8 +39,8 @@ def test_what_moves_smoothly_is_followed_within_tolerance(robot, solver, seed):
     assert set(statuses) == {ik.motion.FollowStatus.FOLLOWING}
     position, angle = robot.errors(np.array(q[1:]), points, normals)
     assert position.max() <= 2e-3
-    told = np.array([state.position_error for state in states])
-    np.testing.assert_allclose(told, position, atol=1e-12)
+    errors = np.array([state.position_error for state in states])
+    np.testing.assert_allclose(errors, position, atol=1e-12)
     np.testing.assert_allclose([state.angle_error for state in states], angle, atol=1e-7)
 
 
@@ -128,10 +128,10 @@ def test_a_long_pause_brings_the_motors_to_rest(robot, solver):
     for target in zip(*robot.contacts(path), strict=True):
         follower(*target)
     assert np.abs(follower.state.velocity).max() > 0.05
-    nothing = np.full((3, 3), np.nan)
+    lost_points = np.full((3, 3), np.nan)
     speeds = []
     for _ in range(120):
-        follower(nothing, nothing)
+        follower(lost_points, lost_points)
         speeds.append(np.abs(follower.state.velocity))
     assert (np.diff(speeds, axis=0) <= 1e-9).all()
     assert speeds[-1].max() == 0
@@ -141,9 +141,9 @@ def test_a_long_pause_brings_the_motors_to_rest(robot, solver):
 def test_out_of_reach_and_back(robot, solver):
     points, normals = robot.contacts(robot.home)
     follower = solver.follow(robot.home, PERIOD)
-    away = np.concatenate([np.linspace(0, 0.9, 400), np.linspace(0.9, 0, 400), np.zeros(600)])
+    excursion = np.concatenate([np.linspace(0, 0.9, 400), np.linspace(0.9, 0, 400), np.zeros(600)])
     q, states = [robot.home], []
-    for off in away:
+    for off in excursion:
         q.append(follower(points + np.array([off, 0.0, 0.0]), normals))
         states.append(follower.state)
     check_limits(robot, follower, np.array(q))
@@ -158,29 +158,29 @@ def test_fingertips_alone_and_a_wrist(robot, solver):
     end = robot.home + 0.1
     points, _ = robot.contacts(end)
     palm = robot.palm(end)
-    away = {}
+    offsets = {}
     for weight in (0.0, 0.1):
         follower = solver.follow(robot.home, PERIOD)
         for _ in range(800):
             follower(points, palm=palm, palm_weight=(weight, weight))
         assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
         assert np.isnan(follower.state.angle_error).all()
-        away[weight] = np.linalg.norm(robot.palm(follower.state.q)[:3, 3] - palm[:3, 3])
-    assert away[0.1] < 0.5 * away[0.0]
+        offsets[weight] = np.linalg.norm(robot.palm(follower.state.q)[:3, 3] - palm[:3, 3])
+    assert offsets[0.1] < 0.5 * offsets[0.0]
 
 
 def test_another_branch_when_asked(robot, solver):
     grasp = ik.load_grasp("cup")
-    first, *others = (one.q for one in solver.solve_all(grasp, limit=4))
+    first, *later_answers = (solution.q for solution in solver.solve_all(grasp, limit=4))
     follower = solver.follow(first, PERIOD)
     for _ in range(50):
         follower(grasp)
     np.testing.assert_allclose(follower.state.q, first, atol=0.1)
-    other = max(others, key=lambda q: np.abs(q - first).max())
-    follower.branch(other)
+    farthest = max(later_answers, key=lambda q: np.abs(q - first).max())
+    follower.branch(farthest)
     q = np.array([follower.state.q] + [follower(grasp) for _ in range(2500)])
     check_limits(robot, follower, q)
-    np.testing.assert_allclose(q[-1], other, atol=0.1)
+    np.testing.assert_allclose(q[-1], farthest, atol=0.1)
     assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
 
 

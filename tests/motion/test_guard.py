@@ -35,13 +35,13 @@ def test_targets_in_a_table_are_not_followed_there(robot, solver):
     for depth in deep:
         q.append(follower(points - np.array([0.0, 0.0, depth]), normals))
         states.append(follower.state)
-    found = clearances(solver, np.array(q))
-    assert found.free.all()
-    assert found.distance.min() < 0.03, "it never came near"
-    np.testing.assert_allclose(states[-1].clearance, found.distance[-1])
+    distances = clearances(solver, np.array(q))
+    assert distances.free.all()
+    assert distances.distance.min() < 0.03, "it never came near"
+    np.testing.assert_allclose(states[-1].clearance, distances.distance[-1])
     for i in (300, 500, 700):
-        away = points - np.array([0.0, 0.0, deep[i]])
-        position, angle = robot.errors(q[i + 1], away, normals)
+        shifted_points = points - np.array([0.0, 0.0, deep[i]])
+        position, angle = robot.errors(q[i + 1], shifted_points, normals)
         np.testing.assert_allclose(states[i].position_error, position, atol=1e-9)
         np.testing.assert_allclose(states[i].angle_error, angle, atol=1e-6)
     statuses = [state.status for state in states]
@@ -57,14 +57,14 @@ def test_targets_in_a_table_are_not_followed_there(robot, solver):
 def test_without_a_compiler_it_stops_at_the_same_places(robot, solver):
     points, normals = robot.contacts(robot.home)
     plain = ik.Solver(robot, scene=ik.load_scene("table"), compiled=False)
-    ways, statuses = [], set()
-    for one in (solver, plain):
-        follower, q = one.follow(robot.home, 5 * PERIOD), []
+    paths, statuses = [], set()
+    for checker in (solver, plain):
+        follower, q = checker.follow(robot.home, 5 * PERIOD), []
         for depth in np.linspace(0, 0.6, 30):
             q.append(follower(points - np.array([0.0, 0.0, depth]), normals))
             statuses.add(follower.state.status)
-        ways.append(q)
-    np.testing.assert_allclose(*ways, atol=1e-6)
+        paths.append(q)
+    np.testing.assert_allclose(*paths, atol=1e-6)
     assert ik.motion.FollowStatus.BLOCKED in statuses
 
 
@@ -85,11 +85,11 @@ def led_through_each_other(body, shares):
     rows = [
         [body.fingers.index(finger) for finger in side.fingers] for side in body.description.sides
     ]
-    way = points[rows[1]].mean(axis=0) - points[rows[0]].mean(axis=0)
+    direction = points[rows[1]].mean(axis=0) - points[rows[0]].mean(axis=0)
     for share in shares:
         goal = points.copy()
-        goal[rows[0]] += share * way
-        goal[rows[1]] -= share * way
+        goal[rows[0]] += share * direction
+        goal[rows[1]] -= share * direction
         yield goal, normals
 
 
@@ -99,15 +99,15 @@ def test_hands_that_are_led_through_each_other_do_not_get_there():
     body = ik.load_robot("g1+dex3")
     solver = ik.Solver(body, scene=ik.Scene())
     plain, careful = ik.Solver(body).follow(body.home, PERIOD), solver.follow(body.home, PERIOD)
-    ways: dict[bool, list] = {True: [body.home], False: [body.home]}
+    paths: dict[bool, list] = {True: [body.home], False: [body.home]}
     statuses = []
     shares = np.append(np.sin(np.linspace(0, np.pi, 500)) ** 2, np.zeros(100))
     for target in led_through_each_other(body, shares):
-        ways[False].append(plain(*target))
-        ways[True].append(careful(*target))
+        paths[False].append(plain(*target))
+        paths[True].append(careful(*target))
         statuses.append(careful.state.status)
-    assert clearances(solver, np.array(ways[False])).distance.min() < -0.01
-    assert clearances(solver, np.array(ways[True])).free.all()
+    assert clearances(solver, np.array(paths[False])).distance.min() < -0.01
+    assert clearances(solver, np.array(paths[True])).free.all()
     assert ik.motion.FollowStatus.BLOCKED in statuses
     assert statuses[-1] is ik.motion.FollowStatus.FOLLOWING
 
@@ -147,9 +147,9 @@ def test_thumbs_that_pass_each_other_on_the_way_to_rest_are_apart_in_every_cycle
     solver = ik.Solver(body, scene=ik.Scene())
     follower, shares = solver.follow(body.home), np.sin(np.linspace(0, np.pi, 2000))[:450] ** 2
     q = [follower(*target) for target in led_through_each_other(body, shares)]
-    found = clearances(solver, np.array(q))
-    assert found.free.all()
-    assert found.distance.min() < 2e-3, "they never came near"
+    distances = clearances(solver, np.array(q))
+    assert distances.free.all()
+    assert distances.distance.min() < 2e-3, "they never came near"
     assert follower.state.status is ik.motion.FollowStatus.BLOCKED
 
 
@@ -181,22 +181,24 @@ def test_a_path_keeps_clear(robot, solver):
 
 def test_what_stands_between_two_free_postures_is_seen(robot):
     """A thin pole that the arm sweeps through, and a ball that is carried through the robot."""
-    way = np.tile(robot.home, (3, 1))
-    way[:, 0] += [-0.7, 0.7, 0.72]
+    q_path = np.tile(robot.home, (3, 1))
+    q_path[:, 0] += [-0.7, 0.7, 0.72]
     x, y, z = robot.palm(robot.home)[:3, 3]
     pole = {"kind": "capsule", "radius": 0.002, "length": 0.1, "xyz": [x, y, z]}
     solver = ik.Solver(robot, scene=ik.Scene({"pole": pole}))
     around = clearances_around(solver)
-    assert around.free(way).all()
-    found = check_path(around, way)
-    assert found.free.tolist() == [False, True]
-    assert found.surplus[0] < 0
-    assert not around.free(found.worst[:1])[0]
-    held = ik.Scene({"ball": {"kind": "sphere", "radius": 0.02, "xyz": [x, y, z]}}, grasped="ball")
+    assert around.free(q_path).all()
+    verdict = check_path(around, q_path)
+    assert verdict.free.tolist() == [False, True]
+    assert verdict.surplus[0] < 0
+    assert not around.free(verdict.worst[:1])[0]
+    scene_in_hand = ik.Scene(
+        {"ball": {"kind": "sphere", "radius": 0.02, "xyz": [x, y, z]}}, grasped="ball"
+    )
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[x, y - 0.5, z], [x, y + 0.5, z]]
-    carrying = ik.Solver(robot, scene=held)
-    problems = carrying._request.of_arrays(*robot.contacts(way[:2]), None)
+    carrying = ik.Solver(robot, scene=scene_in_hand)
+    problems = carrying._request.of_arrays(*robot.contacts(q_path[:2]), None)
     moving = carrying._engine.collision_query(problems.holding("ball", poses))
     standing = np.tile(robot.home, (2, 1))
     assert moving.free(standing).all()

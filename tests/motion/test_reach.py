@@ -30,11 +30,11 @@ def sent(motion):
     )
 
 
-def check_motion(robot, grasp, found, q0):
-    motion, rates = found.motion, rates_of(robot, None, None)
-    assert found.status is ik.motion.ReachStatus.REACHED
+def check_motion(robot, grasp, reach_motion, q0):
+    motion, rates = reach_motion.motion, rates_of(robot, None, None)
+    assert reach_motion.status is ik.motion.ReachStatus.REACHED
     np.testing.assert_array_equal(motion.q[0], q0)
-    np.testing.assert_allclose(motion.q[-1], found.q, atol=1e-9)
+    np.testing.assert_allclose(motion.q[-1], reach_motion.q, atol=1e-9)
     position, angle = robot.errors(motion.q[-1], *grasp.arrays(robot.fingers))
     assert position.max() <= 5e-3
     assert angle.max() <= np.radians(3)
@@ -57,16 +57,16 @@ def check_motion(robot, grasp, found, q0):
 @pytest.mark.parametrize("scene", [None, ik.Scene()], ids=["no scene", "nothing in it"])
 def test_straight_there_then_straight_on_then_closing(robot, grasp, scene):
     grasp, solver = ik.Grasp(grasp.contacts), ik.Solver(robot, scene=scene)
-    found = solver.reach(grasp, distance=0.1, opening=0.025)
-    part = check_motion(robot, grasp, found, robot.home)
-    assert (found.clearance is None) == (scene is None)
+    reach_motion = solver.reach(grasp, distance=0.1, opening=0.025)
+    part = check_motion(robot, grasp, reach_motion, robot.home)
+    assert (reach_motion.clearance is None) == (scene is None)
     assert solver.approach(grasp).success
-    motion = found.motion
+    motion = reach_motion.motion
     coming = robot.palm(motion.q[part == "coming"])
-    way = coming[:, :3, 3] - coming[-1, :3, 3]
-    along = way[0] / np.linalg.norm(way[0])
-    assert np.linalg.norm(way[0]) == pytest.approx(0.1, abs=0.01)
-    assert np.linalg.norm(way - np.outer(way @ along, along), axis=1).max() < 2e-3
+    steps = coming[:, :3, 3] - coming[-1, :3, 3]
+    direction = steps[0] / np.linalg.norm(steps[0])
+    assert np.linalg.norm(steps[0]) == pytest.approx(0.1, abs=0.01)
+    assert np.linalg.norm(steps - np.outer(steps @ direction, direction), axis=1).max() < 2e-3
     assert np.abs(coming[:, :3, :3] - coming[-1, :3, :3]).max() < 0.01
     tips, _ = robot.contacts(motion.q[part == "coming"][-1])
     points, _ = grasp.arrays(robot.fingers)
@@ -79,13 +79,13 @@ def test_straight_there_then_straight_on_then_closing(robot, grasp, scene):
 )
 def test_what_is_sent_keeps_to_the_limits(robot, name, period):
     """Closing passes corners, where joints come to limits; the figures are measured."""
-    found = ik.Solver(robot).reach(ik.load_grasp(name), period=period)
-    velocity, acceleration = sent(found.motion)
+    motion = ik.Solver(robot).reach(ik.load_grasp(name), period=period)
+    velocity, acceleration = sent(motion.motion)
     rates = rates_of(robot, None, None)
     assert (velocity <= rates.velocity * (1 + 1e-9)).all()
     assert (acceleration <= rates.acceleration * (1 + 1e-9)).all()
-    assert found.velocity_share == pytest.approx((velocity / rates.velocity).max())
-    assert (acceleration / rates.acceleration).max() <= found.acceleration_share <= 1
+    assert motion.velocity_share == pytest.approx((velocity / rates.velocity).max())
+    assert (acceleration / rates.acceleration).max() <= motion.acceleration_share <= 1
 
 
 def test_short_and_kinked_paths_are_timed(robot):
@@ -105,67 +105,67 @@ def test_short_and_kinked_paths_are_timed(robot):
 def test_a_clearance_is_that_between_samples_too(robot):
     """A ball beside the way, passed between two samples that are far apart."""
     grasp = ik.Grasp(ik.load_grasp("cup").contacts)
-    way = ik.Solver(robot).reach(grasp).motion
-    going = way.q[way.notes["part"] == "going"]
+    path = ik.Solver(robot).reach(grasp).motion
+    going = path.q[path.notes["part"] == "going"]
     place = robot.palm(going[len(going) // 2])[:3, 3] - np.array([0.0, 0.0, 0.3])
     itself = [
         {"links": pair, "reason": "not of interest"}
-        for pair in combinations(robot.links(way.q[0]), 2)
+        for pair in combinations(robot.links(path.q[0]), 2)
     ]
     ball = {"ball": {"kind": "sphere", "radius": 0.08, "xyz": place.tolist()}}
     solver = ik.Solver(robot, scene=ik.Scene(ball, touching=itself))
-    found = solver.reach(grasp, period=0.08)
-    before = found.motion.q[found.motion.notes["part"] != "closing"]
-    fine = dense(before, 0.1 * motor_units(robot))
-    there = solver.check(fine, grasp).distance.min()
-    assert solver.check(before, grasp).distance.min() > there + 1e-3
-    assert found.clearance == pytest.approx(there, abs=1e-4)
+    motion = solver.reach(grasp, period=0.08)
+    q_before_closing = motion.motion.q[motion.motion.notes["part"] != "closing"]
+    fine = dense(q_before_closing, 0.1 * motor_units(robot))
+    min_distance = solver.check(fine, grasp).distance.min()
+    assert solver.check(q_before_closing, grasp).distance.min() > min_distance + 1e-3
+    assert motion.clearance == pytest.approx(min_distance, abs=1e-4)
     last = solver.approach(grasp)
-    there = solver.check(dense(last.coming, 0.1 * motor_units(robot)), grasp).distance.min()
-    assert last.clearance == pytest.approx(there, abs=1e-4)
+    min_distance = solver.check(dense(last.coming, 0.1 * motor_units(robot)), grasp).distance.min()
+    assert last.clearance == pytest.approx(min_distance, abs=1e-4)
 
 
 def test_around_what_is_in_the_way(robot):
     """A ball where the straight way leads: OMPL goes around it."""
     start = robot.home + 1.6 * (np.arange(14) == 0)
-    ways = np.stack([start, robot.home])
-    place = robot.palm(ways.mean(axis=0))[:3, 3]
+    ends = np.stack([start, robot.home])
+    place = robot.palm(ends.mean(axis=0))[:3, 3]
     solids = {"ball": {"kind": "sphere", "radius": 0.05, "xyz": place.tolist()}}
     solver = ik.Solver(robot, scene=ik.Scene(solids))
-    problem = solver._request.of_arrays(*robot.contacts(ways[1:]), None)
+    problem = solver._request.of_arrays(*robot.contacts(ends[1:]), None)
     around = solver._engine.collision_query(problem).rows(np.zeros(1, dtype=int))
-    assert not around.free(dense(ways, motor_units(robot))).all()
-    corners, how = plan_path(robot, *ways, around, seed=0)
-    assert "OMPL" in how
-    np.testing.assert_array_equal(corners[[0, -1]], ways)
+    assert not around.free(dense(ends, motor_units(robot))).all()
+    corners, reason = plan_path(robot, *ends, around, seed=0)
+    assert "OMPL" in reason
+    np.testing.assert_array_equal(corners[[0, -1]], ends)
     assert around.free(dense(corners, motor_units(robot))).all()
-    inside, why = plan_path(robot, ways.mean(axis=0), ways[1], around, seed=0)
-    assert (inside, why) == (None, "the start is not free: bh_base and ball touch")
+    no_corners, reason_inside = plan_path(robot, ends.mean(axis=0), ends[1], around, seed=0)
+    assert (no_corners, reason_inside) == (None, "the start is not free: bh_base and ball touch")
 
 
 def test_all_of_it_is_free(robot, grasp):
     solver = ik.Solver(robot, scene=ik.load_scene("table"))
-    found = solver.reach(grasp)
-    part = check_motion(robot, grasp, found, robot.home)
+    motion = solver.reach(grasp)
+    part = check_motion(robot, grasp, motion, robot.home)
     problem = solver._request.of_grasps([grasp], None)
     around = solver._engine.collision_query(problem).rows(np.zeros(1, dtype=int))
-    looked_at = dense(found.motion.q[part != "closing"], motor_units(robot))
+    looked_at = dense(motion.motion.q[part != "closing"], motor_units(robot))
     assert around.free(looked_at).all()
-    assert found.clearance >= 0
+    assert motion.clearance >= 0
 
 
 def test_what_cannot_be_reached_is_said(robot, grasp):
-    away = np.eye(4)
-    away[0, 3] = 5.0
-    found = ik.Solver(robot).reach(grasp.at(away))
-    assert (found.status, found.motion) == (ik.motion.ReachStatus.NOT_SOLVED, None)
-    assert not found.success
+    far_pose = np.eye(4)
+    far_pose[0, 3] = 5.0
+    motion = ik.Solver(robot).reach(grasp.at(far_pose))
+    assert (motion.status, motion.motion) == (ik.motion.ReachStatus.NOT_SOLVED, None)
+    assert not motion.success
     points, _ = grasp.arrays(robot.fingers)
     place = (points.mean(axis=0) + np.array([0.0, 0.0, 0.25])).tolist()
     lid = {"lid": {"kind": "box", "size": [0.6, 0.6, 0.02], "xyz": place}}
-    found = ik.Solver(robot, scene=ik.Scene(lid)).reach(grasp, distance=0.3, direction=[0, 0, -1])
-    assert found.status in (ik.motion.ReachStatus.NO_APPROACH, ik.motion.ReachStatus.NOT_SOLVED)
-    assert found.reason
+    motion = ik.Solver(robot, scene=ik.Scene(lid)).reach(grasp, distance=0.3, direction=[0, 0, -1])
+    assert motion.status in (ik.motion.ReachStatus.NO_APPROACH, ik.motion.ReachStatus.NOT_SOLVED)
+    assert motion.reason
     with pytest.raises(ik.errors.InputError, match=r"distance:.*-1.*>= 0"):
         ik.Solver(robot).reach(grasp, distance=-1)
 
@@ -177,10 +177,10 @@ def test_where_the_way_is_barred_the_hand_comes_another(robot, grasp):
     lid = {"lid": {"kind": "box", "size": [0.6, 0.6, 0.02], "xyz": place}}
     solver = ik.Solver(robot, scene=ik.Scene(lid))
     assert not solver.approach(grasp, distance=0.3, direction=[0, 0, -1]).success
-    found = solver.reach(grasp, distance=0.3)
-    assert found.success
-    assert found.clearance >= 0
-    coming = robot.palm(found.motion.q[found.motion.notes["part"] == "coming"])[:, :3, 3]
+    motion = solver.reach(grasp, distance=0.3)
+    assert motion.success
+    assert motion.clearance >= 0
+    coming = robot.palm(motion.motion.q[motion.motion.notes["part"] == "coming"])[:, :3, 3]
     assert np.linalg.norm(coming[-1] - coming[0]) == pytest.approx(0.3, abs=5e-3)
 
 
@@ -188,26 +188,28 @@ def test_it_is_written_as_a_follower_is(robot, grasp, tmp_path):
     motion = ik.Solver(robot).reach(grasp).motion
     for suffix in ("npz", "csv", "mcap"):
         motion.write(tmp_path / f"way.{suffix}")
-    found = np.load(tmp_path / "way.npz")
-    np.testing.assert_array_equal(found["q"], motion.q)
-    assert found["part"].tolist() == motion.notes["part"].tolist()
-    said = f"^{re.escape(str(tmp_path / 'way.txt'))}: found suffix '.txt', expected one of .npz, "
-    with pytest.raises(ik.errors.InputError, match=said):
+    stored = np.load(tmp_path / "way.npz")
+    np.testing.assert_array_equal(stored["q"], motion.q)
+    assert stored["part"].tolist() == motion.notes["part"].tolist()
+    expected_message = (
+        f"^{re.escape(str(tmp_path / 'way.txt'))}: found suffix '.txt', expected one of .npz, "
+    )
+    with pytest.raises(ik.errors.InputError, match=expected_message):
         motion.write(tmp_path / "way.txt")
     assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_the_last_part_alone(robot, grasp):
     """A pre-grasp with open fingers, straight on; in a scene all of it is free, or it is said."""
-    found = ik.Solver(robot).approach(grasp, distance=0.06, opening=0.015)
-    assert (found.success, found.reason, found.clearance) == (True, "", None)
-    np.testing.assert_array_equal(found.pregrasp, found.coming[0])
-    np.testing.assert_array_equal(found.coming[-1], found.closing[0])
-    np.testing.assert_allclose(found.closing[-1], found.q, atol=1e-9)
-    palms = robot.palm(found.coming)[:, :3, 3]
+    motion = ik.Solver(robot).approach(grasp, distance=0.06, opening=0.015)
+    assert (motion.success, motion.reason, motion.clearance) == (True, "", None)
+    np.testing.assert_array_equal(motion.pregrasp, motion.coming[0])
+    np.testing.assert_array_equal(motion.coming[-1], motion.closing[0])
+    np.testing.assert_allclose(motion.closing[-1], motion.q, atol=1e-9)
+    palms = robot.palm(motion.coming)[:, :3, 3]
     assert np.linalg.norm(palms[-1] - palms[0]) == pytest.approx(0.06, abs=2e-3)
-    assert not robot.errors(found.pregrasp, *grasp.arrays(robot.fingers))[0].min() < 0.03
-    middle = robot.palm(found.coming[len(found.coming) // 2])[:3, 3] - 0.1 * np.array([0, 0, 1])
+    assert not robot.errors(motion.pregrasp, *grasp.arrays(robot.fingers))[0].min() < 0.03
+    middle = robot.palm(motion.coming[len(motion.coming) // 2])[:3, 3] - 0.1 * np.array([0, 0, 1])
     wall = {"wall": {"kind": "sphere", "radius": 0.09, "xyz": middle.tolist()}}
     blocked = ik.Solver(robot, scene=ik.Scene(wall)).approach(grasp, distance=0.3, limit=1)
     assert blocked.status in (ik.motion.ReachStatus.NO_APPROACH, ik.motion.ReachStatus.NOT_SOLVED)
@@ -220,11 +222,11 @@ def test_a_palm_that_is_given_is_reached(robot, grasp):
     solution = ik.Solver(robot).solve(grasp)
     motors = robot.actuators[7:]
     posture = dict(zip(motors, solution.q[7:].tolist(), strict=True))
-    found = ik.Solver(robot).reach(ik.Grasp(palm=robot.palm(solution.q), posture=posture))
-    assert found.success
-    np.testing.assert_allclose(robot.palm(found.motion.q[-1]), robot.palm(solution.q), atol=1e-3)
+    motion = ik.Solver(robot).reach(ik.Grasp(palm=robot.palm(solution.q), posture=posture))
+    assert motion.success
+    np.testing.assert_allclose(robot.palm(motion.motion.q[-1]), robot.palm(solution.q), atol=1e-3)
     assert (
-        np.abs(found.motion.q[found.motion.notes["part"] == "coming"] - solution.q)[:, 7:].max()
+        np.abs(motion.motion.q[motion.motion.notes["part"] == "coming"] - solution.q)[:, 7:].max()
         > 0.02
     )
 
@@ -237,19 +239,19 @@ def on_table(robot, grasp):
 
 def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
     solver, ranked = on_table
-    for one in ranked:
-        found = solver.reach(one)
-        assert found.success, found.reason
-        np.testing.assert_array_equal(found.motion.q[-1], one.solution.q)
-        np.testing.assert_array_equal(found.q, one.q)
-        np.testing.assert_array_equal(solver.approach(one).closing[-1], one.q)
-    away = np.eye(4)
-    away[0, 3] = 0.1
-    moved = replace(ranked[0], grasp=grasp.at(away))
-    missed = solver.reach(moved)
+    for choice in ranked:
+        motion = solver.reach(choice)
+        assert motion.success, motion.reason
+        np.testing.assert_array_equal(motion.motion.q[-1], choice.solution.q)
+        np.testing.assert_array_equal(motion.q, choice.q)
+        np.testing.assert_array_equal(solver.approach(choice).closing[-1], choice.q)
+    far_pose = np.eye(4)
+    far_pose[0, 3] = 0.1
+    far_choice = replace(ranked[0], grasp=grasp.at(far_pose))
+    missed = solver.reach(far_choice)
     assert missed.status is ik.motion.ReachStatus.NOT_SOLVED
     assert "100 mm" in missed.reason
-    assert solver.approach(moved).reason == missed.reason
+    assert solver.approach(far_choice).reason == missed.reason
     with pytest.raises(ik.errors.InputError, match=r"grasp:.*Grasp"):
         solver.reach(3)
 
@@ -257,37 +259,39 @@ def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
 def test_candidates_of_choose_are_where_the_object_is(robot, grasp):
     """The grasps come in the object's frame, the answers in the base frame."""
     pose = grasp.object_pose
-    (one,) = ik.Solver(robot).choose([grasp.in_object_frame()], object_pose=pose, limit=1)
+    (choice,) = ik.Solver(robot).choose([grasp.in_object_frame()], object_pose=pose, limit=1)
     for finger, contact in grasp.contacts.items():
-        np.testing.assert_allclose(one.grasp.contacts[finger].point, contact.point, atol=1e-12)
-    np.testing.assert_allclose(one.grasp.object_pose, pose, atol=1e-12)
+        np.testing.assert_allclose(choice.grasp.contacts[finger].point, contact.point, atol=1e-12)
+    np.testing.assert_allclose(choice.grasp.object_pose, pose, atol=1e-12)
 
 
 def test_a_direction_that_is_given_or_known(robot, grasp):
     solver, down = ik.Solver(robot), np.array([0.0, 0.0, -1.0])
-    (one,) = solver.choose([grasp], limit=1)
+    (choice,) = solver.choose([grasp], limit=1)
 
-    def comes(asked, **more):
-        found = solver.reach(asked, distance=0.1, **more)
-        coming = robot.palm(found.motion.q[found.motion.notes["part"] == "coming"])[:, :3, 3]
-        way = coming[-1] - coming[0]
-        return way / np.linalg.norm(way)
+    def comes(requested, **options):
+        motion = solver.reach(requested, distance=0.1, **options)
+        coming = robot.palm(motion.motion.q[motion.motion.notes["part"] == "coming"])[:, :3, 3]
+        approach = coming[-1] - coming[0]
+        return approach / np.linalg.norm(approach)
 
-    assert comes(one, direction=3 * down) @ down > 0.999
+    assert comes(choice, direction=3 * down) @ down > 0.999
     assert comes(grasp, direction=down) @ down > 0.999
-    assert comes(one) @ down < 0.9
-    motors = dict(zip(robot.actuators[7:], one.q[7:].tolist(), strict=True))
-    above = robot.palm(one.q) - np.array([[0, 0, 0, 0]] * 2 + [[0, 0, 0, -0.05]] + [[0, 0, 0, 0]])
-    before = ik.Grasp(palm=above, posture=motors)
-    assert comes(replace(one, grasp=replace(grasp, pregrasp=before))) @ down > 0.999
+    assert comes(choice) @ down < 0.9
+    motors = dict(zip(robot.actuators[7:], choice.q[7:].tolist(), strict=True))
+    above = robot.palm(choice.q) - np.array(
+        [[0, 0, 0, 0]] * 2 + [[0, 0, 0, -0.05]] + [[0, 0, 0, 0]]
+    )
+    pregrasp_palm = ik.Grasp(palm=above, posture=motors)
+    assert comes(replace(choice, grasp=replace(grasp, pregrasp=pregrasp_palm))) @ down > 0.999
     with pytest.raises(ik.errors.InputError, match=r"direction: .*\[0, 0, 0\]"):
         solver.reach(grasp, direction=[0, 0, 0])
 
 
 def test_the_object_goes_along(robot, grasp, on_table):
     solver, ranked = on_table
-    found = solver.reach(ranked[0], lift=0.1, retreat=0.08)
-    motion, part = found.motion, found.motion.notes["part"]
+    reach_motion = solver.reach(ranked[0], lift=0.1, retreat=0.08)
+    motion, part = reach_motion.motion, reach_motion.motion.notes["part"]
     assert list(dict.fromkeys(part)) == ["going", "coming", "closing", "lifting", "retreating"]
     ends = [motion.q[np.flatnonzero(part == name)[-1]] for name in dict.fromkeys(part)]
     np.testing.assert_array_equal(ends[2], ranked[0].q)
@@ -296,15 +300,15 @@ def test_the_object_goes_along(robot, grasp, on_table):
     came = palms[1] - palms[0]
     back = palms[4] - palms[3]
     np.testing.assert_allclose(back, -0.08 * came / np.linalg.norm(came), atol=2e-3)
-    assert max(found.velocity_share, found.acceleration_share) <= 1
+    assert max(reach_motion.velocity_share, reach_motion.acceleration_share) <= 1
     # The cup's brim is 30 mm above its middle: a ball that no finger comes near.
     for height, lift, free in ((0.09, 0.1, False), (0.09, 0.04, True), (0.09, 0.0, True)):
         place = (grasp.object_pose[:3, 3] + np.array([0.0, 0.0, height])).tolist()
         ball = {"ball": {"kind": "sphere", "radius": 0.01, "xyz": place}}
-        other = ik.Solver(robot, scene=ik.Scene(ball)).reach(ranked[0], lift=lift)
-        assert other.success is free
-        assert free or other.status is ik.motion.ReachStatus.NO_RETREAT
-        assert free or other.reason == "lifting is not free: cup and ball touch"
+        other_motion = ik.Solver(robot, scene=ik.Scene(ball)).reach(ranked[0], lift=lift)
+        assert other_motion.success is free
+        assert free or other_motion.status is ik.motion.ReachStatus.NO_RETREAT
+        assert free or other_motion.reason == "lifting is not free: cup and ball touch"
     hand = ik.Solver(ik.load_robot("ar10"))
     with pytest.raises(ik.errors.UnsupportedError, match="no arm that moves its palm"):
         hand.reach(ik.load_grasp("ar10_cup"), lift=0.1)
@@ -321,23 +325,28 @@ def test_what_stands_on_something_may_be_lifted_from_it(robot, grasp, on_table):
 
 def test_from_posture_to_posture(robot, grasp, on_table):
     solver, ranked = on_table
-    found = solver.move(robot.home, ranked[0].q)
-    assert (found.status, found.reason) == (ik.motion.ReachStatus.REACHED, "straight")
-    np.testing.assert_array_equal(found.motion.q[[0, -1]], [robot.home, ranked[0].q])
-    assert set(found.motion.notes["part"]) == {"going"}
-    assert max(found.velocity_share, found.acceleration_share) <= 1
+    motion = solver.move(robot.home, ranked[0].q)
+    assert (motion.status, motion.reason) == (ik.motion.ReachStatus.REACHED, "straight")
+    np.testing.assert_array_equal(motion.motion.q[[0, -1]], [robot.home, ranked[0].q])
+    assert set(motion.motion.notes["part"]) == {"going"}
+    assert max(motion.velocity_share, motion.acceleration_share) <= 1
     start = robot.home + 1.6 * (np.arange(14) == 0)
     place = robot.palm((start + robot.home) / 2)[:3, 3]
     ball = {"ball": {"kind": "sphere", "radius": 0.05, "xyz": place.tolist()}}
     around = ik.Solver(robot, scene=ik.Scene(ball))
-    found = around.move(start, robot.home)
-    assert found.reason == "OMPL, RRT-Connect"
+    motion = around.move(start, robot.home)
+    assert motion.reason == "OMPL, RRT-Connect"
     nothing_held = ik.Grasp(grasp.contacts)
-    there = around.check(dense(found.motion.q, 0.2 * motor_units(robot)), nothing_held).distance
-    assert there.min() >= -1e-4
-    assert found.clearance <= there.min() + 1e-4
-    inside = around.move((start + robot.home) / 2, robot.home)
-    assert (inside.status, inside.motion) == (ik.motion.ReachStatus.NO_WAY, None)
-    assert inside.reason == "the start is not free: bh_base and ball touch"
+    min_distances = around.check(
+        dense(motion.motion.q, 0.2 * motor_units(robot)), nothing_held
+    ).distance
+    assert min_distances.min() >= -1e-4
+    assert motion.clearance <= min_distances.min() + 1e-4
+    move_from_inside = around.move((start + robot.home) / 2, robot.home)
+    assert (move_from_inside.status, move_from_inside.motion) == (
+        ik.motion.ReachStatus.NO_WAY,
+        None,
+    )
+    assert move_from_inside.reason == "the start is not free: bh_base and ball touch"
     with pytest.raises(ik.errors.InputError, match=r"q1:.*lwr_joint_1.*9"):
         solver.move(robot.home, [9.0, *robot.home[1:]])

@@ -32,8 +32,8 @@ def retarget(tmp_path):
 
     def read(robot=None, **keys):
         if robot is not None:
-            others = [name for name in robot.fingers if name != robot.thumb]
-            keys["fingers"] = dict(zip((robot.thumb, *others[:2]), (4, 8, 12), strict=True))
+            other_fingers = [name for name in robot.fingers if name != robot.thumb]
+            keys["fingers"] = dict(zip((robot.thumb, *other_fingers[:2]), (4, 8, 12), strict=True))
         path = tmp_path / "keys.yaml"
         path.write_text(json.dumps(keys))
         return ik.motion.load_retarget(path)
@@ -90,8 +90,8 @@ def test_motions_are_scaled_and_turned(robot, retarget):
     offsets = first.points[:2] - first.palm[:3, 3]
     np.testing.assert_allclose(offsets, 1.5 * tips @ turn.T, atol=1e-12)
     assert np.isnan(first.points[2]).all()
-    turned = retargeter(hand(0.4, np.array([0.1, 0.0, 0.0]), turn=0.3))
-    relative = turned.palm[:3, :3] @ second.palm[:3, :3].T
+    target = retargeter(hand(0.4, np.array([0.1, 0.0, 0.0]), turn=0.3))
+    relative = target.palm[:3, :3] @ second.palm[:3, :3].T
     assert np.arccos((np.trace(relative) - 1) / 2) == pytest.approx(0.3)
 
 
@@ -104,14 +104,14 @@ def test_without_a_frame_the_first_one_tells_it(robot, retarget):
     turn *= np.sign(np.linalg.det(turn))
     frame[[4, 8, 12]] = (points - palm[:3, 3]) @ turn / 1.7 + frame[0]
     config = replace(retarget(robot), scaling=1.7)
-    wanted = ik.motion.Retargeter(config, robot)(frame)
-    np.testing.assert_allclose(wanted.points, points, atol=1e-9)
+    target = ik.motion.Retargeter(config, robot)(frame)
+    np.testing.assert_allclose(target.points, points, atol=1e-9)
 
 
-def spans(frame, wanted, robot, config):
+def spans(frame, target, robot, config):
     """Thumb to index finger of a person and of a robot [m]."""
     thumb, index = (name for name, key in config.fingers.items() if key in (4, 8))
-    tips = wanted.points[[robot.fingers.index(thumb), robot.fingers.index(index)]]
+    tips = target.points[[robot.fingers.index(thumb), robot.fingers.index(index)]]
     return np.linalg.norm(frame[4] - frame[8]), np.linalg.norm(tips[0] - tips[1])
 
 
@@ -126,8 +126,8 @@ def test_sizes_are_those_of_open_hands(name, retarget):
     for bend in (0.0, 0.4, 0.9):
         retargeter = ik.motion.Retargeter(config, robot)
         retargeter(hand(bend, place))
-        person, own = spans(pinch, retargeter(pinch), robot, config)
-        ratios.append(own / person)
+        person, robot_spans = spans(pinch, retargeter(pinch), robot, config)
+        ratios.append(robot_spans / person)
     assert person == pytest.approx(0.02)
     assert 0.85 < ratios[0] < 1.15
     np.testing.assert_allclose(ratios, ratios[0], rtol=1e-9)
@@ -136,8 +136,8 @@ def test_sizes_are_those_of_open_hands(name, retarget):
     half_seen[[2, 6, 10, 14, 18]] = np.nan
     retargeter = ik.motion.Retargeter(config, robot)
     retargeter(half_seen)
-    person, own = spans(pinch, retargeter(pinch), robot, config)
-    assert own / person == pytest.approx(ratios[0], rel=0.25)
+    person, robot_spans = spans(pinch, retargeter(pinch), robot, config)
+    assert robot_spans / person == pytest.approx(ratios[0], rel=0.25)
 
 
 def seen_by_mediapipe(bend, wrist):
@@ -149,24 +149,27 @@ def seen_by_mediapipe(bend, wrist):
 def test_of_world_landmarks_the_wrist_stays(robot, retarget):
     config = retarget(robot)
     home = robot.palm(robot.home)[:3, 3]
-    ways = [(bend, np.array([0.2 * bend, 0.1, 0.5])) for bend in (0.1, 0.5, 0.9)]
+    bends = [(bend, np.array([0.2 * bend, 0.1, 0.5])) for bend in (0.1, 0.5, 0.9)]
     retargeter = ik.motion.Retargeter(config, robot)
-    for bend, place in ways:
-        wanted = retargeter(seen_by_mediapipe(bend, place))
-        np.testing.assert_allclose(wanted.palm[:3, 3], home, atol=1e-12)
+    for bend, place in bends:
+        target = retargeter(seen_by_mediapipe(bend, place))
+        np.testing.assert_allclose(target.palm[:3, 3], home, atol=1e-12)
     assert retargeter.in_hand
     metric = ik.motion.Retargeter(config, robot)
-    for bend, place in ways:
+    for bend, place in bends:
         goes = metric(hand(bend, place))
     # The fingers are where they are of a hand whose wrist goes.
-    offsets = [one.points - one.palm[:3, 3] for one in (wanted, goes)]
+    offsets = [posed_target.points - posed_target.palm[:3, 3] for posed_target in (target, goes)]
     np.testing.assert_allclose(*offsets, atol=1e-9)
     assert np.linalg.norm(goes.palm[:3, 3] - home) > 0.1
     assert not metric.in_hand
     # Who says how far the wrist goes is believed.
-    told = ik.motion.Retargeter(replace(config, travel=1.0), robot)
-    moved = [told(seen_by_mediapipe(*way)).palm[:3, 3] for way in ways]
-    assert np.linalg.norm(moved[-1] - moved[0]) > 0.005
+    moving_retargeter = ik.motion.Retargeter(replace(config, travel=1.0), robot)
+    palm_points = [
+        moving_retargeter(seen_by_mediapipe(*bend_and_place)).palm[:3, 3]
+        for bend_and_place in bends
+    ]
+    assert np.linalg.norm(palm_points[-1] - palm_points[0]) > 0.005
 
 
 @pytest.mark.parametrize("size", [0.35, 0.1])
@@ -193,15 +196,15 @@ def test_a_left_hand_moves_a_right_robot_hand(robot, retarget):
     for i, bend in enumerate((0.5, 0.3, 0.7)):
         place, turn = np.array([0.3, 0.1 * i, 0.5 + 0.05 * i]), 0.3 * i
         c, s = np.cos(turn), np.sin(turn)
-        other = hand(bend, np.zeros(3)) * [1.0, -1.0, 1.0]
-        seen = other @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + place
-        expected, wanted = right(hand(bend, place, turn)), left(seen)
-        np.testing.assert_allclose(wanted.palm, expected.palm, atol=1e-9)
-        tips, own = (one.points - one.palm[:3, 3] for one in (expected, wanted))
-        np.testing.assert_allclose(own @ own.T, tips @ tips.T, atol=1e-9)
+        left_keypoints = hand(bend, np.zeros(3)) * [1.0, -1.0, 1.0]
+        keypoints = left_keypoints @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + place
+        expected, left_target = right(hand(bend, place, turn)), left(keypoints)
+        np.testing.assert_allclose(left_target.palm, expected.palm, atol=1e-9)
+        tips, left_tips = (target.points - target.palm[:3, 3] for target in (expected, left_target))
+        np.testing.assert_allclose(left_tips @ left_tips.T, tips @ tips.T, atol=1e-9)
         # Which way round thumb, index and middle finger stand.
-        assert np.linalg.det(own) == pytest.approx(np.linalg.det(tips))
-        flipped = plain(seen)
+        assert np.linalg.det(left_tips) == pytest.approx(np.linalg.det(tips))
+        flipped = plain(keypoints)
         flat = flipped.points - flipped.palm[:3, 3]
         assert np.linalg.det(flat) == pytest.approx(-np.linalg.det(tips))
 
@@ -210,14 +213,14 @@ def test_smoothing_does_not_depend_on_how_often_it_is_called(robot, retarget):
     """A frame at 30 Hz, looked at once or in every cycle of a follower at a kilohertz or two."""
     config = replace(retarget(robot), scaling=1.0, low_pass=0.3)
     frames = [hand(0.4, np.array([0.05 * i, 0.0, 0.4])) for i in range(5)]
-    found = []
+    ends = []
     for cycles in (1, 33, 66):
         retargeter = ik.motion.Retargeter(config, robot)
         for frame in frames:
             for _ in range(cycles):
-                wanted = retargeter(frame, elapsed=1 / 30 / cycles)
-        found.append(wanted.palm)
-    np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=1e-12)
+                target = retargeter(frame, elapsed=1 / 30 / cycles)
+        ends.append(target.palm)
+    np.testing.assert_allclose(ends[1:], [ends[0]] * 2, atol=1e-12)
     for bad in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ik.errors.InputError, match="elapsed: found "):
             retargeter(frames[0], elapsed=bad)
@@ -227,28 +230,28 @@ def test_low_pass(robot, retarget):
     config = retarget(fingers={"thumb": 4}, scaling=1.0, rpy=(0.0, 0.0, 0.0), low_pass=0.25)
     retargeter = ik.motion.Retargeter(config, robot)
     start = retargeter(hand(0.4, np.zeros(3))).points[0]
-    moved = [retargeter(hand(0.4, np.array([0.1, 0, 0]))).points[0] - start for _ in range(3)]
-    np.testing.assert_allclose([m[0] for m in moved], 0.1 * (1 - 0.75 ** np.arange(1, 4)))
+    shifts = [retargeter(hand(0.4, np.array([0.1, 0, 0]))).points[0] - start for _ in range(3)]
+    np.testing.assert_allclose([m[0] for m in shifts], 0.1 * (1 - 0.75 ** np.arange(1, 4)))
 
 
 def test_a_frame_with_nan_asks_for_nothing_and_is_forgotten(robot, retarget):
     retargeter = ik.motion.Retargeter(retarget(robot), robot)
-    before = retargeter(hand(0.4, np.zeros(3)))
+    target_before = retargeter(hand(0.4, np.zeros(3)))
     bad = hand(0.4, np.zeros(3))
     bad[4, 1] = np.nan
-    wanted = retargeter(bad)
-    assert wanted.palm is None
-    assert np.isnan(wanted.points).all()
+    target = retargeter(bad)
+    assert target.palm is None
+    assert np.isnan(target.points).all()
     after = retargeter(hand(0.4, np.zeros(3)))
-    np.testing.assert_array_equal(after.points, before.points)
+    np.testing.assert_array_equal(after.points, target_before.points)
     with pytest.raises(ik.errors.InputError, match=r"keypoints:.*\(20, 3\).*\(21, 3\)"):
         retargeter(bad[:20])
 
 
 def test_arm_and_hand_follow_a_person(robot, retarget):
     """Who moves as the robot can is followed by fingertips and wrist, whatever the scale."""
-    way = 0.15 * np.sin(np.linspace(0, np.pi, 120))[:, None] * np.sin(np.arange(14))
-    path = robot.home + way
+    excursion = 0.15 * np.sin(np.linspace(0, np.pi, 120))[:, None] * np.sin(np.arange(14))
+    path = robot.home + excursion
     fingers = {"thumb": 4, "finger_2": 8, "finger_3": 12}
     config = retarget(fingers=fingers, scaling=1.7, travel=1.7)
     retargeter = ik.motion.Retargeter(config, robot)
@@ -257,10 +260,10 @@ def test_arm_and_hand_follow_a_person(robot, retarget):
     for keypoints, expected, palm in zip(
         like_robot(robot, path, 1.7), points, robot.palm(path), strict=True
     ):
-        wanted = retargeter(keypoints)
-        np.testing.assert_allclose(wanted.points, expected, atol=1e-9)
-        np.testing.assert_allclose(wanted.palm, palm, atol=1e-9)
-        q = follower(wanted.points, palm=wanted.palm, palm_weight=(0.05, 0.05))
+        target = retargeter(keypoints)
+        np.testing.assert_allclose(target.points, expected, atol=1e-9)
+        np.testing.assert_allclose(target.palm, palm, atol=1e-9)
+        q = follower(target.points, palm=target.palm, palm_weight=(0.05, 0.05))
         assert follower.state.status is ik.motion.FollowStatus.FOLLOWING
         np.testing.assert_allclose(robot.palm(q)[:3, 3], palm[:3, 3], atol=0.02)
 
@@ -286,9 +289,9 @@ def test_both_hands_move_a_body(g1, both_hands):
     follower = ik.Solver(g1).follow(g1.home, period=1 / 30)
     errors, q = [], []
     for i in range(len(both_hands["left"])):
-        wanted = retargeter({side: frames[i] for side, frames in both_hands.items()})
-        q.append(follower(wanted.points, palm=wanted.palm, palm_weight=(0.05, 0.05)))
-        errors.append(np.linalg.norm(g1.contacts(q[-1])[0] - wanted.points, axis=1))
+        target = retargeter({side: frames[i] for side, frames in both_hands.items()})
+        q.append(follower(target.points, palm=target.palm, palm_weight=(0.05, 0.05)))
+        errors.append(np.linalg.norm(g1.contacts(q[-1])[0] - target.points, axis=1))
     assert np.median(errors) < 1e-3
     # The box goes from side to side: with arms alone it would not.
     assert np.ptp(np.array(q)[:, g1.actuators.index("waist_yaw_joint")]) > 0.3
@@ -330,11 +333,11 @@ def test_both_hands_drive_a_body_in_mujoco(g1, both_hands):
     wrong = []
     for cycle in range(int(5.0 / step)):
         newest = {side: frames[int(cycle * step * 30)] for side, frames in both_hands.items()}
-        wanted = retargeter(newest, elapsed=step)
-        data.ctrl[motors] = follower(wanted.points, palm=wanted.palm, palm_weight=(0.05, 0.05))
+        target = retargeter(newest, elapsed=step)
+        data.ctrl[motors] = follower(target.points, palm=target.palm, palm_weight=(0.05, 0.05))
         mujoco.mj_step(model, data)
-        there, _ = g1.contacts(data.qpos[places])
-        wrong.append(np.linalg.norm(there - wanted.points, axis=1).max())
+        points, _ = g1.contacts(data.qpos[places])
+        wrong.append(np.linalg.norm(points - target.points, axis=1).max())
     # The springs' lag at up to half a metre a second is most of it.
     assert np.median(wrong) < 0.01
     assert max(wrong) < 0.05
@@ -348,11 +351,11 @@ def test_a_hand_that_is_not_seen_comes_to_rest(g1, both_hands, sees_both_first):
     first = {side: frames[0] for side, frames in both_hands.items()}
     if sees_both_first:
         assert np.isfinite(retargeter(first).points).all()
-    wanted = retargeter({"left": first["left"]})
-    assert list(wanted.palm) == ["left"]
+    target = retargeter({"left": first["left"]})
+    assert list(target.palm) == ["left"]
     left = [name.startswith("left") for name in g1.fingers]
-    assert np.isfinite(wanted.points[left]).all()
-    assert np.isnan(wanted.points[~np.array(left)]).all()
+    assert np.isfinite(target.points[left]).all()
+    assert np.isnan(target.points[~np.array(left)]).all()
 
 
 def test_joints_of_openxr_are_keypoints(robot, retarget):
@@ -360,11 +363,11 @@ def test_joints_of_openxr_are_keypoints(robot, retarget):
     joints = np.random.default_rng(0).normal(0, 0.05, (26, 3))
     joints[:, 2] += 1.0
     points = joints[[1, 2, 3, 4, 5, 7, 8, 9, 10, 12, 13, 14, 15, 17, 18, 19, 20, 22, 23, 24, 25]]
-    found = [
+    keypoints = [
         ik.motion.Retargeter(config, robot)(frame).points for frame in (points, joints, joints[1:])
     ]
-    assert np.array_equal(found[0], found[1], equal_nan=True)
-    assert np.array_equal(found[0], found[2], equal_nan=True)
+    assert np.array_equal(keypoints[0], keypoints[1], equal_nan=True)
+    assert np.array_equal(keypoints[0], keypoints[2], equal_nan=True)
 
 
 @pytest.mark.parametrize(

@@ -81,18 +81,18 @@ def test_motors_keep_their_velocities_and_catch_up(robot, solver):
 
 def test_the_robots_own_velocities(robot, solver):
     period = 1e-3
-    own = np.array([actuator.velocity for actuator in robot.description.actuators])
+    velocities = np.array([actuator.velocity for actuator in robot.description.actuators])
     path = smooth_path(robot, 2, count=20)
     track = solver.track(grasps_of(robot, *robot.contacts(path)), q0=path[0], period=period)
-    assert (np.abs(np.diff(track.q, axis=0)) <= own * period * (1 + 1e-9)).all()
+    assert (np.abs(np.diff(track.q, axis=0)) <= velocities * period * (1 + 1e-9)).all()
 
 
 def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
     """On the way out of the workspace and back: the contacts are missed there and met again."""
     points, normals = robot.contacts(robot.home)
-    away = 0.8 * np.sin(np.linspace(0, np.pi, 40))
-    moving = [grasp_of(robot, points - [s, 0, 0], normals) for s in away]
-    reachable = [solver.solve(one, diagnose=False).success for one in moving]
+    excursion = 0.8 * np.sin(np.linspace(0, np.pi, 40))
+    moving = [grasp_of(robot, points - [s, 0, 0], normals) for s in excursion]
+    reachable = [solver.solve(target, diagnose=False).success for target in moving]
     assert not all(reachable)
     track = solver.track(moving)
     assert track.success[0]

@@ -37,9 +37,9 @@ def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     ).execute()
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
-            said = output["text"] if output.get("name") == "stderr" else ""
+            stderr = output["text"] if output.get("name") == "stderr" else ""
             # Where no kernel is compiled yet.
-            assert all("once per machine" in line for line in said.split("\n") if line), said
+            assert all("once per machine" in line for line in stderr.split("\n") if line), stderr
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)

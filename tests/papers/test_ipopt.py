@@ -11,8 +11,8 @@ import casadi_ik as ik
 
 def middle(robot, rng, part=0.6):
     """A configuration well within the limits."""
-    centre, half = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
-    return centre + part * half * rng.uniform(-1, 1, len(centre))
+    centre, half_range = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
+    return centre + part * half_range * rng.uniform(-1, 1, len(centre))
 
 
 TIGHT = ik.Tolerance(position=1e-6, angle=1e-6)
@@ -58,8 +58,8 @@ def test_joint_limits_are_kept(tmp_path, rng):
     robot = ik.load_robot(path)
     # Over the motors' own strokes: the robot's ranges leave out what takes a joint past its limit.
     q = rng.uniform(*robot.description.actuator_limits, (20, len(robot.actuators)))
-    beyond = np.asarray(robot.joints(q)["left_3"]) > 0.25
-    assert 3 <= beyond.sum() <= 18
+    is_beyond_limit = np.asarray(robot.joints(q)["left_3"]) > 0.25
+    assert 3 <= is_beyond_limit.sum() <= 18
     start = (robot.lower + robot.upper) / 2
     slider = robot.actuators.index("screw_2")
     start[slider] = robot.lower[slider] + 0.002
@@ -68,7 +68,7 @@ def test_joint_limits_are_kept(tmp_path, rng):
     batch = solver.solve_batch(*robot.contacts(q), q0=start)
     assert batch.limits_ok.all()
     assert (np.asarray(robot.joints(batch.q)["left_3"]) <= 0.25 + 1e-9).all()
-    np.testing.assert_array_equal(batch.success, ~beyond)
+    np.testing.assert_array_equal(batch.success, ~is_beyond_limit)
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
@@ -84,14 +84,14 @@ def test_agrees_with_hand_first(name):
     """Both solve to a micrometre, and their contacts are the same within twice that."""
     robot = ik.load_robot(name)
     points, normals = robot.contacts(robot.random(np.random.default_rng(5), 12))
-    found = [
+    batches = [
         ik.Solver(robot, method, TIGHT).solve_batch(points, normals)
         for method in ("ipopt", "hand-first")
     ]
-    for batch in found:
+    for batch in batches:
         assert batch.success.all(), batch.status_names
         assert batch.limits_ok.all()
-    ours, theirs = (robot.contacts(batch.q) for batch in found)
+    ours, theirs = (robot.contacts(batch.q) for batch in batches)
     np.testing.assert_allclose(ours[0], theirs[0], atol=2e-6)
     np.testing.assert_allclose(ours[1], theirs[1], atol=2e-6)
 
@@ -109,11 +109,11 @@ def test_impossible_contacts_are_met_no_worse_than_by_hand_first(robot, targets)
     points[1, 0] += [0.15, 0.0, 0.0]
     normals[2, 1] *= -1
     solvers = ik.Solver(robot, "ipopt", options={"restarts": 10}), ik.Solver(robot, "hand-first")
-    found = [each.solve_batch(points, normals) for each in solvers]
-    assert not found[0].success.any()
-    assert found[0].limits_ok.all()
-    assert np.all(found[0].restarts == 10)
-    assert np.all(cost(found[0]) <= cost(found[1]) * (1 + 1e-6))
+    batches = [pose_solver.solve_batch(points, normals) for pose_solver in solvers]
+    assert not batches[0].success.any()
+    assert batches[0].limits_ok.all()
+    assert np.all(batches[0].restarts == 10)
+    assert np.all(cost(batches[0]) <= cost(batches[1]) * (1 + 1e-6))
 
 
 def test_free_fingers_and_normals(robot, solver, targets):
@@ -127,12 +127,12 @@ def test_free_fingers_and_normals(robot, solver, targets):
     assert batch.success.all()
     assert np.isnan(batch.position_error[0, 2])
     assert np.isnan(batch.angle_error[2, 0])
-    turned = targets[1][:4].copy()
-    turned[2, 0] *= -1  # the wrong way round, so that it matters whether it counts
+    turned_normals = targets[1][:4].copy()
+    turned_normals[2, 0] *= -1  # the wrong way round, so that it matters whether it counts
     assert solver.solve_batch(
-        points[2:3], np.where(np.isnan(normals), normals, turned)[2:3]
+        points[2:3], np.where(np.isnan(normals), normals, turned_normals)[2:3]
     ).success[0]
-    assert not solver.solve_batch(points[2:3], turned[2:3]).success[0]
+    assert not solver.solve_batch(points[2:3], turned_normals[2:3]).success[0]
 
 
 def test_limits_are_never_left(robot, tmp_path, targets):
@@ -146,17 +146,21 @@ def test_limits_are_never_left(robot, tmp_path, targets):
     # A thumb that has to open further than it can.
     q = robot.home.copy()
     q[robot.actuators.index("bh_thumb_distal")] = -0.5
-    beyond = [array[None] for array in robot.contacts(q)]
-    assert not ik.Solver(robot, "ipopt", options={"restarts": 1}).solve_batch(*beyond).success[0]
-    free = ik.Solver(robot, "ipopt", limits="ignore").solve_batch(*beyond)
+    contacts_beyond = [array[None] for array in robot.contacts(q)]
+    assert (
+        not ik.Solver(robot, "ipopt", options={"restarts": 1})
+        .solve_batch(*contacts_beyond)
+        .success[0]
+    )
+    free = ik.Solver(robot, "ipopt", limits="ignore").solve_batch(*contacts_beyond)
     assert free.success[0]
     assert not free.limits_ok[0]
 
 
 def test_no_restarts_and_a_small_budget(robot, targets):
-    once = ik.Solver(robot, "ipopt", options={"restarts": 0}).solve_batch(*targets)
-    assert np.all(once.restarts == 0)
-    assert 3 <= once.success.sum() < 10
+    without_restarts = ik.Solver(robot, "ipopt", options={"restarts": 0}).solve_batch(*targets)
+    assert np.all(without_restarts.restarts == 0)
+    assert 3 <= without_restarts.success.sum() < 10
     short = ik.Solver(robot, "ipopt", options={"restarts": 0, "max_iterations": 2})
     batch = short.solve_batch(*targets)
     assert set(batch.status_names) == {"ITERATION_LIMIT"}

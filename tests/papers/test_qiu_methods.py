@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from toy_robots import replace
-from trace_checks import Kept
+from trace_checks import TraceRecorder
 
 import casadi_ik as ik
 from casadi_ik import model as robots
@@ -60,15 +60,15 @@ def call(f, q, points, normals) -> np.ndarray:
 def test_own_contacts_are_found_again(robot, closed, rng):
     """For what a hand can do exactly, the step finds how, whatever the posture before."""
     hand = [SPREAD, *FLEXIONS["finger_2"], *FLEXIONS["finger_3"]]
-    others = [i for i in range(14) if i not in hand]
+    fixed_joints = [i for i in range(14) if i not in hand]
     sums = np.array(list(FLEXIONS.values()))
     # Beyond a flexion sum of 140 deg the pad faces back, and its normal reads as another spread.
     fair = [q for q in robot.random(rng, 60) if q[sums].sum(axis=1).max() < np.radians(139)]
     assert len(fair) > 30
     for q in fair:
-        before = robot.random(rng, 1)[0]
-        after = call(closed, before, *seen_from_palm(robot, q))
-        np.testing.assert_array_equal(after[others], before[others])
+        q_before = robot.random(rng, 1)[0]
+        after = call(closed, q_before, *seen_from_palm(robot, q))
+        np.testing.assert_array_equal(after[fixed_joints], q_before[fixed_joints])
         np.testing.assert_allclose(after[hand], q[hand], atol=1e-6)
 
 
@@ -99,9 +99,9 @@ def test_far_side_of_the_circle_is_a_trap_that_ipopt_avoids(own_robot, rng):
 
 def miss(robot, name, q, points, normals) -> float:
     """What eq. (5) minimises: distance of a finger from its point [m]."""
-    reached, _ = seen_from_palm(robot, q)
+    tips, _ = seen_from_palm(robot, q)
     column = list(FLEXIONS).index(name)
-    return float(np.linalg.norm(reached[:, column] - points[:, column]))
+    return float(np.linalg.norm(tips[:, column] - points[:, column]))
 
 
 def test_closed_form_is_the_best_on_a_grid(robot, closed, rng):
@@ -137,11 +137,11 @@ def test_normals_decide_spread_and_flexion_sum(robot, closed, rng):
 def test_attainable_normal_nearest_to_the_demand(robot, closed):
     """A demand beyond the flexion limits is moved to the nearest end."""
     q = robot.home
-    for beyond in (-0.1, -0.3, -0.6):
+    for excess in (-0.1, -0.3, -0.6):
         normals = np.empty((3, 2))
         for column, name in enumerate(FLEXIONS):
             finger = planar_finger(robot.description, name)
-            angle, spread = finger.normal_angle + beyond, finger.ratio * q[SPREAD]
+            angle, spread = finger.normal_angle + excess, finger.ratio * q[SPREAD]
             across = np.sin(angle)
             local = [np.cos(spread) * across, np.sin(spread) * across, np.cos(angle)]
             normals[:, column] = finger.frame[:3, :3] @ local
@@ -169,8 +169,8 @@ def test_fingers_on_one_spread_motor_agree(robot, closed):
     assert np.degrees(after[SPREAD]) == pytest.approx(35, abs=1e-8)
     after = call(closed, q, points, demand(40, 40))
     assert np.degrees(after[SPREAD]) == pytest.approx(40, abs=1e-9)
-    along = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
-    after = call(closed, q, points, along)
+    axes_along = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
+    after = call(closed, q, points, axes_along)
     assert after[SPREAD] == pytest.approx(q[SPREAD], abs=1e-12), "nobody asks for a spread"
     mixed = demand(20, 20)
     mixed[:, 1] = [0, 0, 1]
@@ -187,11 +187,11 @@ def test_spread_keeps_motor_and_joints_within_limits(own_robot, rng):
     hand.write_text(text[:at] + narrow)
     robot = ik.load_robot(own_robot)
     closed = finger_step_function(robot.description, "closed-form")
-    seen = []
+    spreads = []
     for q, points, normals in targets(robot, rng, 60):
-        seen.append(call(closed, q, points, normals)[SPREAD])
-    assert min(seen) == pytest.approx(np.radians(10))
-    assert max(seen) == pytest.approx(np.radians(60))
+        spreads.append(call(closed, q, points, normals)[SPREAD])
+    assert min(spreads) == pytest.approx(np.radians(10))
+    assert max(spreads) == pytest.approx(np.radians(60))
 
 
 def test_unsupported_hands(own_robot, coupled_robot):
@@ -227,10 +227,10 @@ def pinch_targets(robot, count, seed=0):
 
 def run(robot, points, normals, limits="ignore", q0=None, step="closed-form", **options):
     """Batch and traces of a run from home."""
-    kept, options = Kept(), {"max_iterations": 600, **options}
+    recorder, options = TraceRecorder(), {"max_iterations": 600, **options}
     solver = ik.Solver(robot, "enhanced-dls", limits=limits, finger_step=step, options=options)
-    batch = solver.solve_batch(points, normals, q0=q0, log=kept)
-    rows = np.concatenate([block.rows for block in kept.blocks])
+    batch = solver.solve_batch(points, normals, q0=q0, log=recorder)
+    rows = np.concatenate([block.rows for block in recorder.blocks])
     return batch, np.split(rows, np.cumsum(batch.iterations)[:-1])
 
 
@@ -244,7 +244,7 @@ def pinches(robot):
 def of_phase(traces, phase):
     """Rows (k,) of all solves in a phase, and the numbers (k,) of their solves."""
     rows = [trace[trace["phase"] == phase] for trace in traces]
-    numbers = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
+    numbers = np.repeat(np.arange(len(rows)), [len(trace_rows) for trace_rows in rows])
     assert len(numbers) > 100
     return np.concatenate(rows), numbers
 
@@ -280,8 +280,8 @@ def test_choices_that_matter_and_that_do_not(robot):
 
 def test_reaching_moves_arm_and_thumb_alone(robot, pinches):
     rows, _ = of_phase(pinches[3], REACHING)
-    rest = [SPREAD, *FLEXIONS["finger_2"], *FLEXIONS["finger_3"]]
-    assert (rows["q"][:, rest] == robot.home[rest]).all()
+    other_joints = [SPREAD, *FLEXIONS["finger_2"], *FLEXIONS["finger_3"]]
+    assert (rows["q"][:, other_joints] == robot.home[other_joints]).all()
     assert (np.ptp(rows["q"][:, :7], axis=0) > 0.1).all()
     assert np.isnan(rows["sigma_closed_chain"]).all()
     assert np.isnan(rows["palm_motion"]).all()
@@ -324,24 +324,26 @@ def test_alignment_records_the_configuration_after_the_fingers(robot, closed, pi
     for q, number in list(zip(rows["q"], numbers, strict=True))[::50]:
         palm = robot.palm(q)
         local = palm[:3, :3].T @ (points[number, 1:] - palm[:3, 3]).T
-        found = call(closed, q, local, palm[:3, :3].T @ normals[number, 1:].T)
-        np.testing.assert_allclose(q, found, atol=1e-6)
+        q_aligned = call(closed, q, local, palm[:3, :3].T @ normals[number, 1:].T)
+        np.testing.assert_allclose(q, q_aligned, atol=1e-6)
 
 
 def test_alignment_keeps_the_thumb(pinches):
     """A thumb that is off its contact is brought back to it at once, but where a solve is lost."""
     errors = [trace["position_error"][trace["phase"] == ALIGNMENT, 0] for trace in pinches[3]]
-    kept = [each[1] < 0.05 * each[0] for each in errors if len(each) > 2]
-    assert len(kept) > 10
-    assert np.mean(kept) > 0.9
+    improved = [
+        row_errors[1] < 0.05 * row_errors[0] for row_errors in errors if len(row_errors) > 2
+    ]
+    assert len(improved) > 10
+    assert np.mean(improved) > 0.9
 
 
 def test_step_cap(robot):
     _, traces = run(robot, *pinch_targets(robot, 1), step_cap=0.01, max_iterations=50)
     rows, _ = of_phase(traces, REACHING)
     assert rows["step_size"].max() == pytest.approx(0.01, rel=1e-6)
-    moved = np.abs(np.diff(traces[0]["q"][:5], axis=0))
-    assert moved.max() == pytest.approx(0.01, rel=1e-6)
+    steps = np.abs(np.diff(traces[0]["q"][:5], axis=0))
+    assert steps.max() == pytest.approx(0.01, rel=1e-6)
 
 
 def test_ipopt_iterates_as_the_closed_form(robot):
@@ -385,9 +387,9 @@ def test_phases_in_their_order_end_at_the_first_configuration_that_solves(pinche
         assert set(trace["phase"]) <= {REACHING, ALIGNMENT}
         assert np.all(np.diff(trace["phase"].astype(int)) >= 0), "reaching is not returned to"
         if solved:
-            before = trace[:-1][trace["phase"][:-1] == ALIGNMENT]
-            off = before["position_error"].max(axis=1) > 5e-3
-            assert (off | (before["angle_error"].max(axis=1) > np.radians(3))).all()
+            rows_before = trace[:-1][trace["phase"][:-1] == ALIGNMENT]
+            off = rows_before["position_error"].max(axis=1) > 5e-3
+            assert (off | (rows_before["angle_error"].max(axis=1) > np.radians(3))).all()
 
 
 def test_robots_the_paper_has_no_answer_for(coupled_robot):

@@ -63,10 +63,10 @@ def test_another_palm_frame_turns_the_estimate_with_it(own_robot, robot, rng):
         "palm: {link: bh_base,",
         "palm: {link: bh_base, rpy: [0.3, 0.2, 1.0],",
     )
-    own = ik.load_robot(own_robot)
+    own_robot_model = ik.load_robot(own_robot)
     points = rng.normal(size=(3, 3))
-    turned = estimate(robot, points) @ own.description.palm_placement[:3, :3]
-    np.testing.assert_allclose(estimate(own, points), turned, atol=1e-12)
+    rotated = estimate(robot, points) @ own_robot_model.description.palm_placement[:3, :3]
+    np.testing.assert_allclose(estimate(own_robot_model, points), rotated, atol=1e-12)
 
 
 def test_points_on_a_line_give_finite_numbers():
@@ -172,8 +172,8 @@ def test_hierarchy_is_the_successive_projection(rng):
     J, e, steps = damped_steps(rng, 0.1)
     N = [np.eye(9) - np.linalg.pinv(A) @ A for A in J]
     expected = steps[0] + N[0] @ steps[1] + N[0] @ N[1] @ steps[2]
-    found = np.array(step_function(3, 0.1).call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
-    np.testing.assert_allclose(found, expected, atol=1e-10)
+    step = np.array(step_function(3, 0.1).call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
+    np.testing.assert_allclose(step, expected, atol=1e-10)
 
 
 def test_augmented_projection_keeps_every_higher_task(rng):
@@ -183,9 +183,9 @@ def test_augmented_projection_keeps_every_higher_task(rng):
     N = [np.eye(9) - np.linalg.pinv(A) @ A for A in stacked]
     expected = steps[0] + N[0] @ steps[1] + N[1] @ steps[2]
     f = step_function(3, 0.1, "augmented")
-    found = np.array(f.call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
+    step = np.array(f.call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
     # RANK_FLOOR damps the projector a little.
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(step, expected, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -204,8 +204,10 @@ def displaced(robot, q, translation, rotation):
     """Where fingers 2 and 3 get if the palm moves by a motion given in the palm frame."""
     points, normals = robot.contacts(q)
     palm = pin.SE3(robot.palm(q))
-    moved = palm * pin.SE3(pin.exp3(rotation), translation) * palm.inverse()
-    return points[1:] @ moved.rotation.T + moved.translation, normals[1:] @ moved.rotation.T
+    moved_palm = palm * pin.SE3(pin.exp3(rotation), translation) * palm.inverse()
+    return points[1:] @ moved_palm.rotation.T + moved_palm.translation, normals[
+        1:
+    ] @ moved_palm.rotation.T
 
 
 def test_translations_are_found_exactly(robot, motion, rng):

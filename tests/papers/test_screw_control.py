@@ -26,8 +26,8 @@ def middle(toy):
 
 
 def posture(toy, rng, part=0.4):
-    half = 0.5 * (toy.upper - toy.lower)
-    return middle(toy) + part * half * rng.uniform(-1, 1, half.size)
+    half_range = 0.5 * (toy.upper - toy.lower)
+    return middle(toy) + part * half_range * rng.uniform(-1, 1, half_range.size)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -62,7 +62,7 @@ def test_the_compiled_loop_makes_the_same_steps(toy, rng):
     control = law(toy)
     fast = ik.papers.ScrewControl(toy, control.task, 0.5)
     target = control.target(posture(toy, rng))
-    slow, quick = (each.run(None, target, 20) for each in (control, fast))
+    slow, quick = (control_loop.run(None, target, 20) for control_loop in (control, fast))
     np.testing.assert_allclose(quick.q, slow.q, atol=1e-12)
     stepper = fast.stepper(None, target)
     for row in slow.q:
@@ -88,10 +88,10 @@ def test_null_space_returns_to_mid_range_and_the_task_never_notices(toy, rng):
     start = posture(toy, rng, 0.9)
     target = control.target(start)
     centred, left = control.run(start, target, 150), still.run(start, target, 150)
-    half = 0.5 * (toy.upper - toy.lower)
+    half_range = 0.5 * (toy.upper - toy.lower)
 
     def spread(q):
-        return np.abs((q - middle(toy)) / half).max()
+        return np.abs((q - middle(toy)) / half_range).max()
 
     np.testing.assert_allclose(left.q, np.tile(start, (len(left.q), 1)), atol=1e-12)
     assert left.status is ik.Status.STALLED
@@ -186,10 +186,10 @@ def test_an_arm_helps_where_a_finger_alone_cannot_reach(rng):
     goal = control.target(start)["point"] + [0.05, 0.07, -0.05]
     run = control.run(start, {"point": goal}, 60)
     assert run.error_norm[-1] < 1e-6
-    moved = np.abs(run.q[-1] - start) > 1e-6
+    has_moved = np.abs(run.q[-1] - start) > 1e-6
     arm = [name.startswith("right_") for name in baxter.actuators]
     index = [name.startswith("index_") for name in baxter.actuators]
-    assert moved[np.array(arm)].any()
-    assert moved[np.array(index)].all()
-    assert not moved[~(np.array(arm) | np.array(index))].any()
+    assert has_moved[np.array(arm)].any()
+    assert has_moved[np.array(index)].all()
+    assert not has_moved[~(np.array(arm) | np.array(index))].any()
     assert ((run.q >= baxter.lower) & (run.q <= baxter.upper)).all()

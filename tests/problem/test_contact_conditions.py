@@ -92,23 +92,23 @@ def every_kind(test):
 
 @every_kind
 def test_jacobian_of_the_whole_is_the_slope_of_the_residual(robot, kind, rng):
-    q, other = robot.random(rng, 2)
-    p, rows = parameters(data_at(robot, other, rng)), ContactRows((kind,) * 3)
+    q, q_target = robot.random(rng, 2)
+    p, rows = parameters(data_at(robot, q_target, rng)), ContactRows((kind,) * 3)
 
     def residual(x):
         return number(contact_residual(robot.description, rows, ca.SX(x), p)).ravel()
 
-    found = number(contact_jacobian(robot.description, rows, ca.SX(q), p))
-    assert found.shape == (rows.size, 14)
-    np.testing.assert_allclose(found, differences(residual, q), atol=2e-7)
-    assert np.linalg.matrix_rank(found) >= 5
+    jacobian = number(contact_jacobian(robot.description, rows, ca.SX(q), p))
+    assert jacobian.shape == (rows.size, 14)
+    np.testing.assert_allclose(jacobian, differences(residual, q), atol=2e-7)
+    assert np.linalg.matrix_rank(jacobian) >= 5
 
 
 @every_kind
 def test_jacobian_of_the_hand_is_the_slope_of_the_residual(robot, kind, rng):
     """Over a palm that shifts and turns, too: there it is the targets that move."""
-    q, other = robot.random(rng, 2)
-    p, rows = parameters(data_at(robot, other, rng)), ContactRows((kind,) * 3)
+    q, q_target = robot.random(rng, 2)
+    p, rows = parameters(data_at(robot, q_target, rng)), ContactRows((kind,) * 3)
     palm = robot.palm(q)
 
     def at(x):
@@ -121,23 +121,23 @@ def test_jacobian_of_the_hand_is_the_slope_of_the_residual(robot, kind, rng):
         return number(fit_residual(contacts, rows, place, p)).ravel()
 
     contacts, place = at(np.zeros(13))
-    found = number(fit_jacobian(contacts, rows, place, p))
-    np.testing.assert_allclose(found, differences(residual, np.zeros(13)), atol=2e-7)
-    assert np.linalg.matrix_rank(found) > 5
+    jacobian = number(fit_jacobian(contacts, rows, place, p))
+    np.testing.assert_allclose(jacobian, differences(residual, np.zeros(13)), atol=2e-7)
+    assert np.linalg.matrix_rank(jacobian) > 5
 
 
 @every_kind
 def test_hand_and_whole_have_the_same_residual(robot, kind, rng):
     """Lengths are the same in every frame."""
-    q, other = robot.random(rng, 2)
-    p, rows = parameters(data_at(robot, other, rng)), ContactRows((kind,) * 3)
+    q, q_target = robot.random(rng, 2)
+    p, rows = parameters(data_at(robot, q_target, rng)), ContactRows((kind,) * 3)
     palm = robot.palm(q)
     contacts = hand_contacts(robot.description, ca.SX(q[ARM:]), tuple(range(ARM, 14)))
     place = PalmAndHand(ca.DM(palm[:3, :3]), ca.DM(palm[:3, 3]), ca.DM(q[ARM:]))
     hand = rows.errors(ca.DM(number(fit_residual(contacts, rows, place, p))))
-    whole = rows.errors(ca.DM(number(contact_residual(robot.description, rows, ca.SX(q), p))))
-    for one, other_one in zip(hand, whole, strict=True):
-        np.testing.assert_allclose(number(one), number(other_one), atol=1e-12)
+    full_errors = rows.errors(ca.DM(number(contact_residual(robot.description, rows, ca.SX(q), p))))
+    for hand_error, other_one in zip(hand, full_errors, strict=True):
+        np.testing.assert_allclose(number(hand_error), number(other_one), atol=1e-12)
 
 
 @every_kind
@@ -151,9 +151,9 @@ def test_rows_of_newton_are_the_slopes_of_the_error_at_the_target(robot, kind, r
 
     assert np.abs(errors(q)).max() < 1e-7
     linear = linearise_contacts(robot.description, rows, ca.SX(q), p)
-    found = np.vstack([number(linear.thumb), number(linear.others)])
+    jacobian = np.vstack([number(linear.thumb), number(linear.others)])
     slopes = -differences(errors, q)
-    np.testing.assert_allclose(found.T @ found, slopes.T @ slopes, atol=1e-5, rtol=1e-5)
+    np.testing.assert_allclose(jacobian.T @ jacobian, slopes.T @ slopes, atol=1e-5, rtol=1e-5)
 
 
 def own_errors(kind, data, frames):
@@ -168,16 +168,16 @@ def own_errors(kind, data, frames):
     cosine = np.sum(frames[:, :3, 0] * data["normals"], axis=1)
     third = np.cross(data["normals"], data["tangents"])
     goal = np.stack([data["normals"], data["tangents"], third], axis=2)
-    turned = Rotation.from_matrix(goal @ frames[:, :3, :3].transpose(0, 2, 1)).magnitude()
-    return distance, {"normal": np.arccos(cosine), "frame": turned}[kind.orientation]
+    turn_angles = Rotation.from_matrix(goal @ frames[:, :3, :3].transpose(0, 2, 1)).magnitude()
+    return distance, {"normal": np.arccos(cosine), "frame": turn_angles}[kind.orientation]
 
 
 @every_kind
 def test_errors_are_distances_and_angles(robot, kind, rng):
     """Of the residual, of the rotation vectors, and as they are measured: all three agree."""
     place, facing = kind.conditions
-    for q, other in robot.random(rng, 10).reshape(5, 2, 14):
-        data, rows = data_at(robot, other, rng), ContactRows((kind,) * 3)
+    for q, q_target in robot.random(rng, 10).reshape(5, 2, 14):
+        data, rows = data_at(robot, q_target, rng), ContactRows((kind,) * 3)
         p, frames = parameters(data, np.ones((3, 2))), robot.contact_frames(q)
         distance, angle = own_errors(kind, data, frames)
         residual = ca.DM(number(contact_residual(robot.description, rows, ca.SX(q), p)))
@@ -200,11 +200,11 @@ def test_errors_are_distances_and_angles(robot, kind, rng):
 angles = st.floats(-3.1, 3.1)
 
 
-@given(turn=st.tuples(angles, angles, angles), about=st.sampled_from([0, 1, 2]))
-def test_a_frame_weighs_every_turn_alike(turn, about):
+@given(turn=st.tuples(angles, angles, angles), rotation_axis=st.sampled_from([0, 1, 2]))
+def test_a_frame_weighs_every_turn_alike(turn, rotation_axis):
     """The length of its residual is the chord of the angle, about whatever axis it is turned."""
     start = Rotation.from_euler("xyz", turn)
-    axis, angle = np.eye(3)[about], abs(turn[0])
+    axis, angle = np.eye(3)[rotation_axis], abs(turn[0])
     end = Rotation.from_rotvec(axis * angle) * start
     tip, goal = (
         {"normal": ca.DM(R.as_matrix()[:, 0]), "tangent": ca.DM(R.as_matrix()[:, 1])}
@@ -218,24 +218,24 @@ def test_a_frame_weighs_every_turn_alike(turn, about):
 
 def test_a_frame_without_a_tangent_is_a_normal(robot, rng):
     """A tangent of zero is free, so one kernel serves fingers with and without one."""
-    q, other = robot.random(rng, 2)
-    data = data_at(robot, other, rng)
+    q, q_target = robot.random(rng, 2)
+    data = data_at(robot, q_target, rng)
     data["tangents"] = np.zeros((3, 3))
     p = parameters(data, np.ones((3, 2)))
     frame, normal = (
         ContactRows((ContactKind("point", "frame"),) * 3),
         ContactRows(point_normal_kinds(3)),
     )
-    found, expected = (
+    errors, expected = (
         rows.errors(ca.DM(number(contact_residual(robot.description, rows, ca.SX(q), p))))
         for rows in (frame, normal)
     )
-    for one, another in zip(found, expected, strict=True):
-        np.testing.assert_allclose(number(one), number(another), atol=1e-14)
-    one, another = (
+    for error, expected_error in zip(errors, expected, strict=True):
+        np.testing.assert_allclose(number(error), number(expected_error), atol=1e-14)
+    error, expected_error = (
         linearise_contacts(robot.description, rows, ca.SX(q), p) for rows in (frame, normal)
     )
-    gram = [np.vstack([number(x.thumb), number(x.others)]) for x in (one, another)]
+    gram = [np.vstack([number(x.thumb), number(x.others)]) for x in (error, expected_error)]
     np.testing.assert_allclose(gram[0].T @ gram[0], gram[1].T @ gram[1], atol=1e-9)
 
 
@@ -271,16 +271,16 @@ def test_graphs_of_different_kinds_have_different_names():
 
 
 def test_contact_frames_hold_the_contacts(robot, coupled_robot, rng):
-    for one in (robot, coupled_robot):
-        q = one.random(rng, 20)
-        frames, (points, normals) = one.contact_frames(q), one.contacts(q)
-        assert frames.shape == (20, len(one.fingers), 4, 4)
+    for model in (robot, coupled_robot):
+        q = model.random(rng, 20)
+        frames, (points, normals) = model.contact_frames(q), model.contacts(q)
+        assert frames.shape == (20, len(model.fingers), 4, 4)
         np.testing.assert_allclose(frames[..., :3, 3], points, atol=1e-12)
         np.testing.assert_allclose(frames[..., :3, 0], normals, atol=1e-12)
-        turned = np.swapaxes(frames[..., :3, :3], -1, -2) @ frames[..., :3, :3]
-        np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-12)
+        gram = np.swapaxes(frames[..., :3, :3], -1, -2) @ frames[..., :3, :3]
+        np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
         np.testing.assert_allclose(np.linalg.det(frames[..., :3, :3]), 1.0, atol=1e-12)
-        np.testing.assert_array_equal(one.contact_frames(q[0]), frames[0])
+        np.testing.assert_array_equal(model.contact_frames(q[0]), frames[0])
 
 
 def test_the_tangent_is_the_x_axis_of_the_described_contact_frame(robot, rng):
@@ -324,8 +324,8 @@ def test_pose_jacobian(robot, posture):
         palm = robot.palm(np.concatenate([x, q[ARM:]]))
         return np.concatenate([palm[:3, 3] / LENGTH, palm[:3, :3].T.ravel()])
 
-    found = number(pose_jacobian(robot.description, ca.SX(q[:ARM])))
-    np.testing.assert_allclose(found, differences(features, q[:ARM]), atol=1e-7)
+    jacobian = number(pose_jacobian(robot.description, ca.SX(q[:ARM])))
+    np.testing.assert_allclose(jacobian, differences(features, q[:ARM]), atol=1e-7)
 
 
 def test_residual_vanishes_at_the_generating_configuration(robot, layouts, posture):
@@ -354,16 +354,16 @@ def test_reach_row(robot, shift, sign):
     wrist = np.array([0.3, 0.3, 0.6]) * (1 + shift) if sign >= 0 else np.array([0.1, 0, 0.2])
     origin = arm.shoulder + wrist - rotation @ arm.wrist_in_palm
 
-    def moved(x):
+    def rows_after(x):
         R, o = compose((ca.DM(rotation), ca.DM(origin)), exp_se3(ca.DM(x)))
         return PalmAndHand(R, o, ca.DM.zeros(HAND))
 
     def row(x):
-        return number(reach_row(arm, range(ARM), moved(x), p)[0]).ravel()
+        return number(reach_row(arm, range(ARM), rows_after(x), p)[0]).ravel()
 
-    found = row(np.zeros(6))
-    assert np.sign(found[0]) == sign
-    slope = number(reach_row(arm, range(ARM), moved(np.zeros(6)), p)[1])
+    row_values = row(np.zeros(6))
+    assert np.sign(row_values[0]) == sign
+    slope = number(reach_row(arm, range(ARM), rows_after(np.zeros(6)), p)[1])
     np.testing.assert_allclose(slope, differences(row, np.zeros(6)), atol=1e-7)
     assert np.any(slope) == (sign != 0)
 
@@ -371,19 +371,21 @@ def test_reach_row(robot, shift, sign):
 def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
     start = nearest_start(robot.description)
     palm = robot.palm(robot.home)
-    passed, distances, arms = -1.0, [], []
+    previous, distances, arms = -1.0, [], []
     for _ in range(NUMERIC_ARM_PARAMETERS.table_size):
-        arm, passed = start(palm[:3, :3], palm[:3, 3], passed)
-        distances.append(float(passed))
+        arm, previous = start(palm[:3, :3], palm[:3, 3], previous)
+        distances.append(float(previous))
         arms.append(np.array(arm).ravel())
     assert np.all(np.diff(distances) > 0)
     assert len(np.unique(np.round(arms, 9), axis=0)) == NUMERIC_ARM_PARAMETERS.table_size
     # After the last one they begin anew.
-    assert float(start(palm[:3, :3], palm[:3, 3], passed)[1]) == distances[0]
+    assert float(start(palm[:3, :3], palm[:3, 3], previous)[1]) == distances[0]
     q = np.tile(robot.home, (1, 1))
     q[0, :ARM] = arms[0]
-    there = robot.palm(q[0])
-    off = np.sum(((there - palm)[:3, 3] / LENGTH) ** 2) + np.sum((there - palm)[:3, :3] ** 2)
+    target_pose = robot.palm(q[0])
+    off = np.sum(((target_pose - palm)[:3, 3] / LENGTH) ** 2) + np.sum(
+        (target_pose - palm)[:3, :3] ** 2
+    )
     assert distances[0] == pytest.approx(off, abs=1e-9)
 
 
@@ -396,14 +398,18 @@ def test_a_solve_tries_all_starts_of_the_numeric_arm():
 
 
 def test_a_step_of_the_numeric_arm_lowers_what_it_promises(robot, rng):
-    q, other = robot.random(rng, 2)
+    q, q_target = robot.random(rng, 2)
     palm = robot.palm(np.clip(q + 0.01, robot.lower, robot.upper))
-    p = fit_parameters(robot, *robot.contacts(other))
+    p = fit_parameters(robot, *robot.contacts(q_target))
     target = Pose(ca.SX(palm[:3, :3]), ca.SX(palm[:3, 3]))
-    tried = pose_step(robot.description, ca.SX(q[:ARM]), target, ca.SX(1e-6), p)
-    before, there = (np.sum(number(r) ** 2) for r in (tried.residual_before, tried.residual))
-    assert there < 0.01 * before
-    assert before - there == pytest.approx(float(number(tried.predicted_decrease)[0, 0]), rel=0.05)
+    trial = pose_step(robot.description, ca.SX(q[:ARM]), target, ca.SX(1e-6), p)
+    cost_before, cost_after = (
+        np.sum(number(r) ** 2) for r in (trial.residual_before, trial.residual)
+    )
+    assert cost_after < 0.01 * cost_before
+    assert cost_before - cost_after == pytest.approx(
+        float(number(trial.predicted_decrease)[0, 0]), rel=0.05
+    )
 
 
 def test_within_tolerance_compares_the_angle():

@@ -35,9 +35,9 @@ def test_what_is_free_has_no_error(robot, solver):
     assert np.argwhere(np.isnan(batch.angle_error)).tolist() == [[0, 1], [1, 2]]
 
 
-def spoiled(which, index, value):
+def spoiled(field, index, value):
     points, normals = arrays()
-    (points if which == "points" else normals)[index] = value
+    (points if field == "points" else normals)[index] = value
     return points, normals
 
 

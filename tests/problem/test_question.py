@@ -29,8 +29,8 @@ def test_every_contact_is_judged_by_its_own_tolerance(robot, method):
     """Fingers that must be exact are, at the cost of the thumb that need not be."""
     options = {"finger_step": "closed-form"} if method.startswith("enhanced") else {}
     solver = ik.Solver(robot, method, tolerance=ik.Tolerance(1e-3, 1e-2), **options)
-    asked = grasp(robot, robot.home + 0.02, {robot.thumb: COARSE})
-    solution = solver.solve(asked)
+    grasp_with_coarse = grasp(robot, robot.home + 0.02, {robot.thumb: COARSE})
+    solution = solver.solve(grasp_with_coarse)
     assert solution.success
     for name, contact in solution.contacts.items():
         expected = COARSE if name == robot.thumb else ik.Tolerance(1e-3, 1e-2)
@@ -46,8 +46,8 @@ def test_a_coarse_contact_makes_a_grasp_possible(robot):
     coarse = {robot.thumb: COARSE}
     solution = ik.Solver(robot).solve(grasp(robot, q, coarse, shift=0.07))
     assert solution.success
-    others = [solution.contacts[name] for name in robot.fingers if name != robot.thumb]
-    assert max(contact.position_error for contact in others) <= 5e-3
+    fine_contacts = [solution.contacts[name] for name in robot.fingers if name != robot.thumb]
+    assert max(contact.position_error for contact in fine_contacts) <= 5e-3
 
 
 def test_tolerances_by_finger_of_a_batch(robot):
@@ -88,11 +88,11 @@ def test_fixed_actuators_stay_where_they_are(robot, method):
     assert free.success.all()
     for row in range(3):
         value = float(free.q[row, 2])
-        held = solver.solve_batch(
+        batch = solver.solve_batch(
             points[row][None], normals[row][None], fixed={"lwr_joint_3": value}
         )
-        assert held.success.all()
-        assert held.q[0, 2] == value
+        assert batch.success.all()
+        assert batch.q[0, 2] == value
 
 
 def test_a_spread_that_does_not_fit_is_found_out(robot):
@@ -107,14 +107,14 @@ def test_a_spread_that_does_not_fit_is_found_out(robot):
 
 def test_what_is_refused(robot):
     solver = ik.Solver(robot)
-    asked = grasp(robot, robot.home)
+    grasp_at_home = grasp(robot, robot.home)
     with pytest.raises(ik.errors.UnknownNameError, match=r"fixed:.*'elbow'.*lwr_"):
-        solver.solve(asked, fixed={"elbow": 0.0})
+        solver.solve(grasp_at_home, fixed={"elbow": 0.0})
     with pytest.raises(ik.errors.InputError, match=r"fixed\.lwr_joint_1:.*7"):
-        solver.solve(asked, fixed={"lwr_joint_1": 7})
+        solver.solve(grasp_at_home, fixed={"lwr_joint_1": 7})
     paper = ik.Solver(robot, "enhanced-dls", finger_step="closed-form")
     with pytest.raises(ik.errors.UnsupportedError, match="'enhanced-dls'"):
-        paper.solve(asked, fixed={"lwr_joint_1": 0.0})
+        paper.solve(grasp_at_home, fixed={"lwr_joint_1": 0.0})
     with pytest.raises(ik.errors.InputError, match=r"tolerance\.pinky: .*thumb, finger_2"):
         ik.Solver(robot, tolerance={"pinky": COARSE})
     with pytest.raises(ik.errors.InputError, match=r"tolerance\.thumb:.*3.*Tolerance"):

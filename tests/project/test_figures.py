@@ -75,9 +75,9 @@ def test_paper_agrees_with_the_reports() -> None:
     paper = text_of(ROOT / "paper" / "paper.md")
     assert f"none of {missed_targets().split()[-1]} reachable targets" in paper
     assert f"takes {float(batch_time()):.0f} microseconds" in paper
-    ours, *others = means().values()
+    ours, *other_means = means().values()
     assert label(ours) in paper
-    assert f"{label(min(others)).split()[0]} to {label(max(others))}" in paper
+    assert f"{label(min(other_means)).split()[0]} to {label(max(other_means))}" in paper
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,8 @@ def test_every_robot_has_a_row():
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_a_row_names_the_sources_of_its_file(path):
     text = " ".join(" ".join(yaml.safe_load(path.read_text())["sources"].values()).split())
-    known = [x for x in LICENCES if re.search(rf"(?<![\w/-]){re.escape(x)}(?![\w-])", text)]
-    assert ROBOTS[f"`{path.stem}`"].rpartition("| ")[2] == (", ".join(known) or "assumed")
+    licences = [x for x in LICENCES if re.search(rf"(?<![\w/-]){re.escape(x)}(?![\w-])", text)]
+    assert ROBOTS[f"`{path.stem}`"].rpartition("| ")[2] == (", ".join(licences) or "assumed")
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

@@ -72,8 +72,8 @@ def test_the_core_solves_and_logs_without_extras(tmp_path):
     "program", ["import casadi_ik", "import casadi_ik as ik; ik.Solver; ik.load_robot('ar10')"]
 )
 def test_what_is_imported(program):
-    more = f"; import sys; print(*(x for x in {ON_DEMAND!r}.split() if x in sys.modules))"
-    done = python("-c", program + more)
+    script_end = f"; import sys; print(*(x for x in {ON_DEMAND!r}.split() if x in sys.modules))"
+    done = python("-c", program + script_end)
     assert (done.stdout.strip(), done.stderr, done.returncode) == ("", "", 0)
 
 
@@ -88,8 +88,8 @@ def test_the_oldest_dependencies_are_the_lower_bounds():
 
 @pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda p: p.stem)
 def test_workflows_and_forms_are_yaml(path):
-    found = yaml.safe_load(path.read_text())
-    for job in found.get("jobs", {}).values():
+    content = yaml.safe_load(path.read_text())
+    for job in content.get("jobs", {}).values():
         assert {"runs-on", "steps"} <= job.keys()
 
 

@@ -103,7 +103,7 @@ def test_an_unknown_kind_is_an_error(coupled_robot):
     joints = coupled_robot.description.joints
     described = dataclasses.replace(
         coupled_robot.description,
-        joints=tuple(wired if one is joint else one for one in joints),
+        joints=tuple(wired if joint_entry is joint else joint_entry for joint_entry in joints),
     )
     with pytest.raises(ik.errors.UnsupportedError, match="Wire"):
         ik.ArmHand(described).contacts(coupled_robot.home)

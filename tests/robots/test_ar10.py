@@ -56,8 +56,10 @@ def test_pads_face_where_the_fingers_flex(ar10):
         normal = ar10.contacts(q)[1][ar10.fingers.index(finger.name)]
         last = {joint.name: joint for joint in ar10.description.movable}[finger.joints[-1]]
         link = ar10.links(q)[last.child]
-        moved = np.cross(link[:3, :3] @ last.axis, ar10.contacts(q)[0][rows[0] // 2] - link[:3, 3])
-        np.testing.assert_allclose(moved / np.linalg.norm(moved), normal, atol=2e-3)
+        velocity = np.cross(
+            link[:3, :3] @ last.axis, ar10.contacts(q)[0][rows[0] // 2] - link[:3, 3]
+        )
+        np.testing.assert_allclose(velocity / np.linalg.norm(velocity), normal, atol=2e-3)
 
 
 def test_published_ranges(ar10):

@@ -28,13 +28,15 @@ def test_a_side_by_itself_stands_as_it_does_in_the_body(name):
     points, normals = robot.contacts(q)
     motors = set(body.trunk)
     for side in body.sides:
-        alone = ik.ArmHand(body.side(side.name))
-        assert not motors & set(alone.actuators)
-        motors |= set(alone.actuators)
-        own = [body.actuator_index(motor) for motor in alone.actuators]
-        there, facing = alone.contacts(q[own])
+        side_robot = ik.ArmHand(body.side(side.name))
+        assert not motors & set(side_robot.actuators)
+        motors |= set(side_robot.actuators)
+        columns = [body.actuator_index(motor) for motor in side_robot.actuators]
+        side_points, facing = side_robot.contacts(q[columns])
         fingers = [body.finger_names.index(finger) for finger in side.fingers]
-        np.testing.assert_allclose(there @ base[:3, :3].T + base[:3, 3], points[fingers], atol=1e-9)
+        np.testing.assert_allclose(
+            side_points @ base[:3, :3].T + base[:3, 3], points[fingers], atol=1e-9
+        )
         np.testing.assert_allclose(facing @ base[:3, :3].T, normals[fingers], atol=1e-9)
     assert motors == set(robot.actuators)
 
@@ -51,17 +53,18 @@ def test_a_body_with_mirrored_sides_reflects(name):
     q[left] = (body.lower + rng.random(len(q)) * (body.upper - body.lower))[left]
     # A motor whose range is the other's turned round runs the other way; of ranges that are
     # symmetric the axis tells.
-    for one, other in zip(left, right, strict=True):
+    for left_vector, right_vector in zip(left, right, strict=True):
         joints = [
-            next(j for j in body.movable if j.name == body.actuator_names[i]) for i in (one, other)
+            next(j for j in body.movable if j.name == body.actuator_names[i])
+            for i in (left_vector, right_vector)
         ]
         mirrored = -joints[0].axis * [1, -1, 1]
-        q[other] = q[one] * np.sign(mirrored @ joints[1].axis)
+        q[right_vector] = q[left_vector] * np.sign(mirrored @ joints[1].axis)
     points, normals = robot.contacts(q)
-    half = len(points) // 2
+    half_count = len(points) // 2
     across = np.array([1.0, -1.0, 1.0])
-    np.testing.assert_allclose(points[:half] * across, points[half:], atol=1e-9)
-    np.testing.assert_allclose(normals[:half] * across, normals[half:], atol=1e-9)
+    np.testing.assert_allclose(points[:half_count] * across, points[half_count:], atol=1e-9)
+    np.testing.assert_allclose(normals[:half_count] * across, normals[half_count:], atol=1e-9)
     np.testing.assert_array_less(robot.lower[right] - 1e-9, q[right])
     np.testing.assert_array_less(q[right], robot.upper[right] + 1e-9)
 
@@ -141,7 +144,7 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "expected_words"),
     [
         (
             ", locked: {neck: 0, tail: 0}",
@@ -170,34 +173,40 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
         ("sides:", "colour: red\nsides:", "colour"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, said: str):
+def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, expected_words: str):
     in_a_file.write_text(FILE.replace(old, new, 1))
-    refused(in_a_file, said.replace("{folder}", str(in_a_file.parent)))
+    refused(in_a_file, expected_words.replace("{folder}", str(in_a_file.parent)))
 
 
 def test_arms_stand_at_places_that_are_all_given(tmp_path: Path):
-    path, given = tmp_path / "pair.yaml", "{arm: panda, hand: allegro_left%s}"
+    path, part_template = tmp_path / "pair.yaml", "{arm: panda, hand: allegro_left%s}"
     sides = ", at: {xyz: [0, 0.3, 0]}", ""
-    text = "name: pair\ntrunk: lift\nsides:\n  left: " + given + "\n  right: " + given + "\n"
+    text = (
+        "name: pair\ntrunk: lift\nsides:\n  left: "
+        + part_template
+        + "\n  right: "
+        + part_template
+        + "\n"
+    )
     path.write_text(text % sides)
     refused(path, "sides.right.at: missing; expected a pose as in sides.left")
     path.write_text(text % (sides[0], ", at: {}"))
     robot = ik.load_robot(path)
-    apart = robot.palm(robot.home, "left") - robot.palm(robot.home, "right")
-    np.testing.assert_allclose(apart[:3, 3], [0, 0.3, 0], atol=1e-12)
+    separation = robot.palm(robot.home, "left") - robot.palm(robot.home, "right")
+    np.testing.assert_allclose(separation[:3, 3], [0, 0.3, 0], atol=1e-12)
 
 
-def refused(path: Path, said: str):
+def refused(path: Path, expected_words: str):
     """One line that names the file is said of it."""
     with pytest.raises(ik.errors.DescriptionError) as caught:
         ik.load_robot(path)
-    assert said in str(caught.value)
+    assert expected_words in str(caught.value)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("follower", "leader", "said"),
+    ("follower", "leader", "expected_words"),
     [
         ("right_finger", "left_finger", "sides.right: {} which belongs to side 'left'"),
         ("left_wrist", "right_finger", "sides.left: {} which belongs to side 'right'"),
@@ -205,15 +214,17 @@ def refused(path: Path, said: str):
         ("waist", "left_wrist", "trunk: {} which belongs to side 'left'"),
     ],
 )
-def test_a_motor_of_two_sides_is_refused(in_a_file: Path, follower: str, leader: str, said: str):
+def test_a_motor_of_two_sides_is_refused(
+    in_a_file: Path, follower: str, leader: str, expected_words: str
+):
     file = in_a_file.with_suffix(".urdf")
     joint = f'<joint name="{follower}" type="revolute">'
     file.write_text(file.read_text().replace(joint, f'{joint}<mimic joint="{leader}"/>'))
-    refused(in_a_file, said.format(f"joint {follower!r} follows motor {leader!r},"))
+    refused(in_a_file, expected_words.format(f"joint {follower!r} follows motor {leader!r},"))
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "expected_words"),
     [
         ("hand: allegro_left, ", "", "sides.left.hand: missing"),
         ("arm: panda, hand: allegro_left", "arm: pandora, hand: allegro_left", "pandora"),
@@ -231,10 +242,10 @@ def test_a_motor_of_two_sides_is_refused(in_a_file: Path, follower: str, leader:
         ),
     ],
 )
-def test_what_is_wrong_with_parts_is_said(tmp_path: Path, old: str, new: str, said: str):
+def test_what_is_wrong_with_parts_is_said(tmp_path: Path, old: str, new: str, expected_words: str):
     path = tmp_path / "pair.yaml"
     path.write_text(BODY.replace(old, new, 1))
-    refused(path, said)
+    refused(path, expected_words)
 
 
 def test_a_side_that_is_not_there_is_said():

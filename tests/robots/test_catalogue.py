@@ -55,34 +55,34 @@ def test_every_hand_goes_on_an_arm(hand):
 
 @pytest.mark.parametrize("arm", PUBLISHED["arms"])
 def test_arms_stand_where_published_files_have_them(arm):
-    known = PUBLISHED["arms"][arm]
+    published = PUBLISHED["arms"][arm]
     robot = ik.load_robot(arm)
     tip = robot.description.joints[-1]  # fixed to the arm's last link
-    for q, pose in zip(known["q"], known["poses"], strict=True):
-        last = np.array(known["base"]) @ robot.links(q)[tip.parent]
-        theirs = np.array(pose) @ np.linalg.inv(known["tip"])
-        np.testing.assert_allclose(last, theirs, atol=known["tolerance"])
-        if "flange" in known:  # the published link is the flange, perhaps with its axes turned
-            turned = np.eye(4)
-            turned[:3, :3] = known["flange"]
+    for q, pose in zip(published["q"], published["poses"], strict=True):
+        last = np.array(published["base"]) @ robot.links(q)[tip.parent]
+        theirs = np.array(pose) @ np.linalg.inv(published["tip"])
+        np.testing.assert_allclose(last, theirs, atol=published["tolerance"])
+        if "flange" in published:  # the published link is the flange, perhaps with its axes turned
+            palm_pose = np.eye(4)
+            palm_pose[:3, :3] = published["flange"]
             np.testing.assert_allclose(
-                last @ tip.placement, np.array(pose) @ turned, atol=known["tolerance"]
+                last @ tip.placement, np.array(pose) @ palm_pose, atol=published["tolerance"]
             )
 
 
 @pytest.mark.parametrize("hand", PUBLISHED["hands"])
 def test_hands_stand_where_published_files_have_them(hand):
-    known = PUBLISHED["hands"][hand]
-    robot, q = ik.load_robot(hand), np.array(known["q"])
-    found = numpy_oracle.links(robot, dict(zip(known["joints"], q.T, strict=True)))
-    for i, links in enumerate(known["links"]):
+    published = PUBLISHED["hands"][hand]
+    robot, q = ik.load_robot(hand), np.array(published["q"])
+    poses = numpy_oracle.links(robot, dict(zip(published["joints"], q.T, strict=True)))
+    for i, links in enumerate(published["links"]):
         assert len(links) >= FEWER.get(hand, 3)
         for link, pose in links.items():
-            np.testing.assert_allclose(found[link][i, :3], pose, atol=known["tolerance"])
+            np.testing.assert_allclose(poses[link][i, :3], pose, atol=published["tolerance"])
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "expected_words"),
     [
         ("pander+allegro_right", "arm or body is called 'pander'; did you mean 'panda'?"),
         ("panda+allegra", "hand is called 'allegra'; did you mean 'allegro_"),
@@ -94,8 +94,10 @@ def test_hands_stand_where_published_files_have_them(hand):
         ("foo", "; bodies: baxter+ar10, "),
     ],
 )
-def test_unknown_robots_are_named(name, said):
-    with pytest.raises(ik.errors.UnknownNameError, match=f"^no shipped .*{re.escape(said)}"):
+def test_unknown_robots_are_named(name, expected_words):
+    with pytest.raises(
+        ik.errors.UnknownNameError, match=f"^no shipped .*{re.escape(expected_words)}"
+    ):
         ik.load_robot(name)
 
 
@@ -130,8 +132,8 @@ def test_a_hand_alone_is_a_robot(name: str, rng: np.random.Generator) -> None:
     assert robot.palm(robot.home).shape == (4, 4)
     solved = ik.Solver(robot).solve_batch(points, normals)
     assert solved.success.all()
-    there, _ = robot.contacts(solved.q)
-    assert np.linalg.norm(there - points, axis=2).max() <= 5e-3
+    points_reached, _ = robot.contacts(solved.q)
+    assert np.linalg.norm(points_reached - points, axis=2).max() <= 5e-3
 
 
 def test_a_hand_of_one_joint_says_where_it_is() -> None:
@@ -178,10 +180,10 @@ OPENED = {
 @pytest.mark.parametrize("gripper", OPENED)
 def test_pads_face_each_other(gripper: str) -> None:
     robot = ik.load_robot(gripper)
-    for motor, apart in OPENED[gripper]:
+    for motor, opening in OPENED[gripper]:
         points, normals = robot.contacts(np.array([motor]))
-        np.testing.assert_allclose(points[0] + apart * normals[0], points[1], atol=1e-6)
-        np.testing.assert_allclose(points[1] + apart * normals[1], points[0], atol=1e-6)
+        np.testing.assert_allclose(points[0] + opening * normals[0], points[1], atol=1e-6)
+        np.testing.assert_allclose(points[1] + opening * normals[1], points[0], atol=1e-6)
 
 
 @pytest.mark.slow

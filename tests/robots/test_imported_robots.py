@@ -19,21 +19,24 @@ from casadi_ik.model.urdf_mjcf import read_tree
 MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
 
 
-def both(tmp_path, arm_text="", hand_text="", more=MOUNT, hand_changes=(), joints=6):
+def both(tmp_path, arm_text="", hand_text="", hand_mount=MOUNT, hand_changes=(), joints=6):
     """An arm and a hand in files of their own; the robot, and its files' differences from it."""
     arm(tmp_path, joints)
     hand(tmp_path, *hand_changes)
     path = describe(
         tmp_path,
-        f"arm: {{file: arm.urdf{arm_text}}}\nhand: {{file: hand.urdf{hand_text}}}\n{more}",
+        f"arm: {{file: arm.urdf{arm_text}}}\nhand: {{file: hand.urdf{hand_text}}}\n{hand_mount}",
     )
     return ik.load_robot(path)
 
 
-def check(robot, path, rng, locked=None, beside=None, carried=None):
+def check(robot, path, rng, locked=None, beside=None, carried_file=None):
     pytest.importorskip("pinocchio")
     q = robot.random(rng, 5)
-    trees = [None if one is None else read_tree(one) for one in (path, beside, carried)]
+    trees = [
+        None if path_or_none is None else read_tree(path_or_none)
+        for path_or_none in (path, beside, carried_file)
+    ]
     assert largest_difference(robot, trees[0], q, locked, *trees[1:]) < 1e-12
     assert (robot.beyond_limits(q) <= 1e-9).all()
 
@@ -66,14 +69,14 @@ def test_clashing_joints_of_the_hand_get_a_prefix(tmp_path, rng):
 def test_a_link_beyond_the_tip_may_be_called_like_one_of_the_hand(tmp_path, rng):
     """An arm's file that ends in a `right_hand`, with which the hand's begins."""
     path, box = arm(tmp_path, 6), '<geometry><box size="0.3 0.2 0.1"/></geometry>'
-    more = f'<link name="left_tip"><collision>{box}</collision></link>'
-    more += joint("wrist_plate", "flange", "left_tip", "fixed", xyz="0.3 0 0", rpy="0 1 0")
-    path.write_text(path.read_text().replace("</robot>", f"{more}</robot>"))
+    extra_link = f'<link name="left_tip"><collision>{box}</collision></link>'
+    extra_link += joint("wrist_plate", "flange", "left_tip", "fixed", xyz="0.3 0 0", rpy="0 1 0")
+    path.write_text(path.read_text().replace("</robot>", f"{extra_link}</robot>"))
     hand_path = hand(tmp_path)
     text = f"arm: {{file: arm.urdf, tip: flange}}\nhand: {{file: hand.urdf}}\n{MOUNT}"
     robot = ik.load_robot(describe(tmp_path, text))
     assert "left_tip" in robot.description.links
-    check(robot, path, rng, carried=hand_path)
+    check(robot, path, rng, carried_file=hand_path)
     check(robot, hand_path, rng, beside=path)
     shapes, _, _ = robot_shapes(robot.description, (read_tree(path), read_tree(hand_path)))
     assert "left_tip" not in shapes
@@ -126,7 +129,9 @@ def test_one_file_with_its_palm(tmp_path, rng):
     text += joint("roll", "rail", "tool", "continuous", axis="0.6 0 0.8", rpy="0.4 0 0")
     text += joint("flange", "tool", "base_link", "fixed", rpy="0.1 0.2 0.3")
     text += joint("left_spread", "base_link", "left_1", axis="0 0 1")
-    text += joint("left_bend", "left_1", "left_tip", limit='velocity="0" effort="0"', more=MIMIC)
+    text += joint(
+        "left_bend", "left_1", "left_tip", limit='velocity="0" effort="0"', attributes=MIMIC
+    )
     text += joint("right_bend", "base_link", "right_tip", limit='upper="1" velocity="0" effort="0"')
     path = urdf(tmp_path / "whole.urdf", text)
     robot = ik.load_robot(describe(tmp_path, "robot: {file: whole.urdf, palm: base_link}"))
@@ -149,7 +154,7 @@ def test_a_follower_without_limits_goes_as_far_as_what_it_follows(tmp_path):
         tmp_path / "hand.urdf",
         link("base_link", "left_1", "left_tip", "right_tip"),
         joint("left_spread", "base_link", "left_1"),
-        joint("left_bend", "left_1", "left_tip", "continuous", more=MIMIC),
+        joint("left_bend", "left_1", "left_tip", "continuous", attributes=MIMIC),
         joint("right_bend", "base_link", "right_tip"),
     )
     robot = ik.load_robot(describe(path.parent, "hand: {file: hand.urdf}"))
@@ -252,12 +257,20 @@ def test_a_robot_without_a_thumb_is_solved_and_logged(tmp_path, rng):
 @pytest.mark.parametrize("kind", ["one finger", "one motor"])
 def test_small_hands_are_solved(tmp_path, rng, kind):
     fingers = FINGERS if kind == "one motor" else "\n".join(FINGERS.splitlines()[:3])
-    held = "" if kind == "one finger" else ", locked: {left_spread: 0, right_spread: 0}"
+    locked_text = "" if kind == "one finger" else ", locked: {left_spread: 0, right_spread: 0}"
     shared = ('joint="right_bend"', 'joint="left_bend"')
-    robot = both(tmp_path, hand_text=held, hand_changes=[shared] if held else [], more="", joints=6)
-    if held:
+    robot = both(
+        tmp_path,
+        hand_text=locked_text,
+        hand_changes=[shared] if locked_text else [],
+        hand_mount="",
+        joints=6,
+    )
+    if locked_text:
         hand(tmp_path, shared, ("<mimic", "<mimic"))
-        text = f"arm: {{file: arm.urdf}}\nhand: {{file: hand.urdf{held[:-1]}, right_bend: 0}}}}"
+        text = (
+            f"arm: {{file: arm.urdf}}\nhand: {{file: hand.urdf{locked_text[:-1]}, right_bend: 0}}}}"
+        )
         robot = ik.load_robot(describe(tmp_path, text))
         assert len(robot.actuators) == 7
     else:
@@ -324,7 +337,7 @@ def test_mjcf_moves_as_mujoco_says(mjcf, rng):
     robot = ik.load_robot(mjcf)
     assert robot.actuators == ("wrist_a", "wrist_b", "left_a", "right_c", "pull")
     assert robot.description.arm_actuators == (0, 1)
-    assert [one.effort for one in robot.description.actuators[:3]] == [3.0, np.inf, 0.8]
+    assert [actuator.effort for actuator in robot.description.actuators[:3]] == [3.0, np.inf, 0.8]
     q = robot.random(rng, 20)
     assert largest_difference(robot, read_tree(mjcf.parent / "hand.xml"), q) < 1e-12
     assert (robot.beyond_limits(q) <= 1e-9).all()
@@ -333,8 +346,10 @@ def test_mjcf_moves_as_mujoco_says(mjcf, rng):
 def test_equality_is_a_polynomial_of_displacements(mjcf, rng):
     robot = ik.load_robot(mjcf)
     joints = robot.joints(robot.random(rng, 10))
-    moved = joints["left_a"] - 0.3  # the initial position
-    np.testing.assert_allclose(joints["left_b"], 0.1 + 0.5 * moved + 0.3 * moved**2, atol=1e-14)
+    displacement = joints["left_a"] - 0.3  # the initial position
+    np.testing.assert_allclose(
+        joints["left_b"], 0.1 + 0.5 * displacement + 0.3 * displacement**2, atol=1e-14
+    )
 
 
 def test_tendon_is_a_motor_that_its_joints_share_by_their_ranges(mjcf, rng):

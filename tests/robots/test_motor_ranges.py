@@ -50,11 +50,11 @@ def narrow_barrett(folder):
         if joint["name"].endswith("distal"):
             joint["limits"] = ["8 deg", "30 deg"]
     (folder / "hand.yaml").write_text(yaml.safe_dump(hand))
-    whole = yaml.safe_load((models / "arm_hands" / "kuka_lwr_barrett_coupled.yaml").read_text())
-    whole |= {"name": "narrow", "arm": "arm.yaml", "hand": "hand.yaml"}
-    whole["home"] |= {f"bh_{finger}_proximal": "60 deg" for finger in ("thumb", "finger_2")}
-    whole["home"]["bh_finger_3_proximal"] = "60 deg"
-    path.write_text(yaml.safe_dump(whole))
+    data = yaml.safe_load((models / "arm_hands" / "kuka_lwr_barrett_coupled.yaml").read_text())
+    data |= {"name": "narrow", "arm": "arm.yaml", "hand": "hand.yaml"}
+    data["home"] |= {f"bh_{finger}_proximal": "60 deg" for finger in ("thumb", "finger_2")}
+    data["home"]["bh_finger_3_proximal"] = "60 deg"
+    path.write_text(yaml.safe_dump(data))
     return ik.load_robot(path)
 
 

@@ -28,11 +28,11 @@ def test_copy_with_relative_paths_is_the_same_robot(own_robot, robot, rng, monke
 
 def test_mount_turns_and_shifts_the_hand(own_robot, robot, rng):
     replace(own_robot, "mount: {xyz: [0, 0, 0], rpy: [0, 0, 0]}", "mount: {xyz: [0, 0, 1 cm]}")
-    own = ik.load_robot(own_robot)
+    own_robot_model = ik.load_robot(own_robot)
     q = robot.random(rng, 3)
     shift = robot.palm(q)[:, :3, 2] * 0.01
     np.testing.assert_allclose(
-        own.contacts(q)[0], robot.contacts(q)[0] + shift[:, None], atol=1e-15
+        own_robot_model.contacts(q)[0], robot.contacts(q)[0] + shift[:, None], atol=1e-15
     )
 
 
@@ -40,13 +40,13 @@ def test_joints_may_stand_in_any_order(tmp_path, rng):
     path = copy_shipped_robot(tmp_path)
     hand = tmp_path / "hand.yaml"
     lines = hand.read_text().split("joints:\n")
-    body, rest = lines[1].split("\npalm:")
+    body, remainder = lines[1].split("\npalm:")
     entries = ["  - " + entry for entry in body.split("  - ")[1:]]
-    hand.write_text(lines[0] + "joints:\n" + "\n".join(reversed(entries)) + "\npalm:" + rest)
-    own, shipped = ik.load_robot(path), ik.load_robot("kuka_lwr_barrett")
+    hand.write_text(lines[0] + "joints:\n" + "\n".join(reversed(entries)) + "\npalm:" + remainder)
+    own_robot_model, shipped = ik.load_robot(path), ik.load_robot("kuka_lwr_barrett")
     q = shipped.random(rng, 3)
-    assert own.actuators == shipped.actuators
-    np.testing.assert_allclose(own.contacts(q), shipped.contacts(q), atol=1e-15)
+    assert own_robot_model.actuators == shipped.actuators
+    np.testing.assert_allclose(own_robot_model.contacts(q), shipped.contacts(q), atol=1e-15)
 
 
 def test_couplings_follow_their_closed_formulas(coupled_robot, rng):
@@ -128,18 +128,18 @@ def test_any_name_of_robot_and_fingers_will_do(tmp_path, rng):
     replace(path, "name: kuka_lwr_barrett", 'name: "7 dwarfs & a hand-1"')
     replace(path, "[thumb, finger_2", "[thumb, ring-finger")
     replace(tmp_path / "hand.yaml", "  finger_2:", "  ring-finger:")
-    own = ik.load_robot(path)
-    points, normals = own.contacts(own.home)
+    own_robot_model = ik.load_robot(path)
+    points, normals = own_robot_model.contacts(own_robot_model.home)
     for finger_step in ("closed-form", "ipopt"):
         solver = ik.Solver(
-            own,
+            own_robot_model,
             "enhanced-dls",
             finger_step=finger_step,
             compiled=False,
             options={"max_iterations": 3},
         )
         assert solver.solve_batch(points[None], normals[None]).success.all()
-    assert 'name="7 dwarfs &amp; a hand-1"' in own.urdf()
+    assert 'name="7 dwarfs &amp; a hand-1"' in own_robot_model.urdf()
 
 
 def test_load_robot_says_what_is_wrong():
@@ -176,10 +176,10 @@ def in_full(folder: Path, name: str = "kuka_lwr_barrett", **changes: Any) -> Pat
 
 @pytest.mark.parametrize("name", ["kuka_lwr_barrett", "ar10"])
 def test_it_is_the_same_robot(name, tmp_path, rng):
-    whole, named = ik.load_robot(in_full(tmp_path, name)), ik.load_robot(name)
-    assert whole.actuators == named.actuators
+    robot_in_full, named = ik.load_robot(in_full(tmp_path, name)), ik.load_robot(name)
+    assert robot_in_full.actuators == named.actuators
     q = named.random(rng, 5)
-    for ours, theirs in zip(whole.contacts(q), named.contacts(q), strict=True):
+    for ours, theirs in zip(robot_in_full.contacts(q), named.contacts(q), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 

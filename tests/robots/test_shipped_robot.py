@@ -250,11 +250,11 @@ def test_unknown_names_list_the_known(robot):
 def test_what_was_worked_out_of_a_description_is_no_part_of_it() -> None:
     """Else every solver would have kernels of its own."""
     description = ik.load_robot("kuka_lwr_barrett").description
-    before = pickle.dumps(description)
+    data_before = pickle.dumps(description)
     assert description.movable
     assert description.arm_actuators
-    assert pickle.dumps(description) == before
-    assert pickle.loads(before).actuator_names == description.actuator_names
+    assert pickle.dumps(description) == data_before
+    assert pickle.loads(data_before).actuator_names == description.actuator_names
 
 
 # Baxter's right arm with the AR10.
@@ -275,21 +275,21 @@ def test_arm_and_mount(baxter, rng):
 
 
 def test_the_hand_is_the_ar10(baxter, rng):
-    alone = ik.load_robot("ar10")
-    assert baxter.actuators[7:] == alone.actuators
+    hand_alone = ik.load_robot("ar10")
+    assert baxter.actuators[7:] == hand_alone.actuators
     assert baxter.actuators[:7] == (
         "right_s0", "right_s1", "right_e0", "right_e1", "right_w0", "right_w1", "right_w2",
     )  # fmt: skip
-    assert baxter.fingers == alone.fingers
+    assert baxter.fingers == hand_alone.fingers
     q = baxter.random(rng, 20)
     hand = baxter.links(q)["hand_base"]
-    points, normals = alone.contacts(q[:, 7:])
+    points, normals = hand_alone.contacts(q[:, 7:])
     found_points, found_normals = baxter.contacts(q)
-    moved = np.einsum("kij,kfj->kfi", hand[:, :3, :3], points) + hand[:, None, :3, 3]
-    np.testing.assert_allclose(found_points, moved, atol=1e-14)
+    expected_points = np.einsum("kij,kfj->kfi", hand[:, :3, :3], points) + hand[:, None, :3, 3]
+    np.testing.assert_allclose(found_points, expected_points, atol=1e-14)
     turned_normals = np.einsum("kij,kfj->kfi", hand[:, :3, :3], normals)
     np.testing.assert_allclose(found_normals, turned_normals, atol=1e-14)
-    np.testing.assert_allclose(baxter.palm(q), hand @ alone.palm(alone.home), atol=1e-14)
+    np.testing.assert_allclose(baxter.palm(q), hand @ hand_alone.palm(hand_alone.home), atol=1e-14)
 
 
 # The Barrett hand as it is driven: four motors, distal joints a third of the proximal ones.
@@ -305,8 +305,8 @@ def coupled() -> ik.ArmHand:
 def independent(coupled: ik.ArmHand, robot: ik.ArmHand, q: np.ndarray) -> np.ndarray:
     """The same posture in the coordinates of the hand with independent distal joints."""
     joints = coupled.joints(q)
-    known = dict(zip(coupled.actuators, q.T, strict=True)) | joints
-    return np.stack([known[name] for name in robot.actuators], axis=1)
+    positions = dict(zip(coupled.actuators, q.T, strict=True)) | joints
+    return np.stack([positions[name] for name in robot.actuators], axis=1)
 
 
 def test_eleven_motors(coupled, robot):

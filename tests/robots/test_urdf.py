@@ -64,8 +64,8 @@ def test_mimic_joints_stand_for_the_linear_couplings(pair, rng):
                 values[model.joints[model.getJointId(name)].idx_q] = value
         pin.framesForwardKinematics(model, data, values)
         for name, pose in robot.links(q).items():
-            found = data.oMf[model.getFrameId(name, pin.FrameType.BODY)].homogeneous
-            np.testing.assert_allclose(pose, found, atol=1e-12, err_msg=name)
+            frame_pose = data.oMf[model.getFrameId(name, pin.FrameType.BODY)].homogeneous
+            np.testing.assert_allclose(pose, frame_pose, atol=1e-12, err_msg=name)
 
 
 def test_something_is_drawn_of_every_part(robot):
@@ -79,5 +79,5 @@ def test_couplings_without_a_urdf_form_are_said(pair):
     robot, _ = pair
     text = robot.urdf()
     for joint in robot.description.movable:
-        said = f"<!-- {joint.coupling} -->" in text
-        assert said == isinstance(joint.coupling, robots.LeadScrew | robots.FourBar)
+        is_mentioned = f"<!-- {joint.coupling} -->" in text
+        assert is_mentioned == isinstance(joint.coupling, robots.LeadScrew | robots.FourBar)

@@ -32,7 +32,7 @@ def test_no_start_of_another_optimiser_comes_nearer(name):
     assert (batch.status == ik.Status.NEAREST)[~batch.success].all()
     assert (~batch.success).sum() >= 3
     assert batch.limits_ok.all()
-    found = distances(solver, points, normals, batch.q)
+    start_distances = distances(solver, points, normals, batch.q)
     tolerances = np.array([(item.position, item.angle) for item in solver.tolerances.values()])
     for row in np.flatnonzero(~batch.success):
 
@@ -44,7 +44,7 @@ def test_no_start_of_another_optimiser_comes_nearer(name):
 
         for start in robot.random(rng, 6):
             best = least_squares(residual, start, bounds=(robot.lower, robot.upper))
-            assert found[row] <= 2 * best.cost * (1 + 1e-6)
+            assert start_distances[row] <= 2 * best.cost * (1 + 1e-6)
 
 
 def test_the_error_ratio_says_how_far_outside(robot):

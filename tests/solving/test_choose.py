@@ -27,12 +27,14 @@ def cup() -> ik.Grasp:
 @pytest.fixture(scope="module")
 def candidates(cup) -> list[ik.Grasp]:
     """The cup's grasp turned about the cup, in the cup's frame; some of them out of reach."""
-    own = cup.in_object_frame()
+    cup_in_frame = cup.in_object_frame()
     angles = np.linspace(0, 2 * np.pi, COUNT, endpoint=False)
-    return [replace(own.at(turned(angle)), object_pose=np.eye(4)) for angle in angles]
+    return [
+        replace(cup_in_frame.at(rotated_pose(angle)), object_pose=np.eye(4)) for angle in angles
+    ]
 
 
-def turned(angle: float) -> np.ndarray:
+def rotated_pose(angle: float) -> np.ndarray:
     pose = np.eye(4)
     pose[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     return pose
@@ -40,38 +42,40 @@ def turned(angle: float) -> np.ndarray:
 
 def scored(robot, q, prefer, q0):
     if prefer == "limits":
-        half = (robot.upper - robot.lower) / 2
-        return (np.minimum(q - robot.lower, robot.upper - q) / half).min(axis=1)
+        half_range = (robot.upper - robot.lower) / 2
+        return (np.minimum(q - robot.lower, robot.upper - q) / half_range).min(axis=1)
     return -np.linalg.norm((q - q0) / (robot.upper - robot.lower), axis=1)
 
 
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
 def test_the_order_is_that_of_the_score(solver, robot, candidates, cup, prefer):
     ranked = solver.choose(candidates, cup.object_pose, robot.home, 20, prefer, per_candidate=None)
-    q = np.stack([one.solution.q for one in ranked])
-    scores = np.array([one.score for one in ranked])
+    q = np.stack([choice.solution.q for choice in ranked])
+    scores = np.array([choice.score for choice in ranked])
     np.testing.assert_allclose(scores, scored(robot, q, prefer, robot.home), atol=1e-12)
     assert (np.diff(scores) <= 0).all()
     assert len(ranked) > 5
     # One after the other nobody does better.
-    alone = [solver.choose([one], cup.object_pose, robot.home, 1, prefer) for one in candidates]
-    best = max(one[0].score for one in alone if len(one))
+    single_rankings = [
+        solver.choose([choice], cup.object_pose, robot.home, 1, prefer) for choice in candidates
+    ]
+    best = max(choice[0].score for choice in single_rankings if len(choice))
     assert ranked[0].score == pytest.approx(best, abs=1e-9)
 
 
 def test_answers_meet_their_candidates_and_differ(solver, robot, candidates, cup):
     ranked = solver.choose(candidates, object_pose=cup.object_pose, limit=30)
     parts = []
-    for one in ranked:
-        points, normals = candidates[one.candidate].at(cup.object_pose).arrays(robot.fingers)
-        position, angle = robot.errors(one.solution.q, points, normals)
+    for choice in ranked:
+        points, normals = candidates[choice.candidate].at(cup.object_pose).arrays(robot.fingers)
+        position, angle = robot.errors(choice.solution.q, points, normals)
         assert (position <= 5e-3).all()
         assert (angle <= np.deg2rad(3)).all()
-        assert robot.beyond_limits(one.solution.q) <= 1e-9
-        assert one.solution.success
-        parts.append(one.solution.q / (robot.upper - robot.lower))
+        assert robot.beyond_limits(choice.solution.q) <= 1e-9
+        assert choice.solution.success
+        parts.append(choice.solution.q / (robot.upper - robot.lower))
     for i, part in enumerate(parts):
-        assert all(np.abs(part - other).max() >= 0.25 for other in parts[:i])
+        assert all(np.abs(part - other_part).max() >= 0.25 for other_part in parts[:i])
     assert ranked.answered + sum(ranked.failures.values()) == ranked.candidates == COUNT
     assert len(solver.choose(candidates, cup.object_pose, limit=3)) == 3
     alike = solver.choose(candidates, cup.object_pose, limit=200, apart=0)
@@ -79,33 +83,42 @@ def test_answers_meet_their_candidates_and_differ(solver, robot, candidates, cup
 
 
 def test_one_answer_of_a_candidate_unless_asked(solver, candidates, cup):
-    for most, prefer in ((1, None), (2, None), (2, "manipulability"), (None, None)):
+    for max_solutions, prefer in ((1, None), (2, None), (2, "manipulability"), (None, None)):
         ranked = solver.choose(
-            candidates, cup.object_pose, limit=60, prefer=prefer, apart=0, per_candidate=most
+            candidates,
+            cup.object_pose,
+            limit=60,
+            prefer=prefer,
+            apart=0,
+            per_candidate=max_solutions,
         )
-        places = np.bincount([one.candidate for one in ranked])
-        assert places.max() == most if most else places.max() > 2
+        places = np.bincount([choice.candidate for choice in ranked])
+        assert places.max() == max_solutions if max_solutions else places.max() > 2
         assert ranked.answered == np.count_nonzero(places)
 
 
 def test_a_candidate_in_the_objects_frame_is_the_one_moved_to_it(solver, candidates, cup):
-    placed = [one.at(cup.object_pose) for one in candidates]
-    there = solver.choose(placed)
-    here = solver.choose(candidates, object_pose=cup.object_pose)
+    placed = [candidate.at(cup.object_pose) for candidate in candidates]
+    ranked_placed = solver.choose(placed)
+    ranked_by_pose = solver.choose(candidates, object_pose=cup.object_pose)
     # Of candidates that are equal but for rounding either may be first.
-    scores = [[one.score for one in ranked] for ranked in (here, there)]
+    scores = [
+        [candidate.score for candidate in ranked] for ranked in (ranked_by_pose, ranked_placed)
+    ]
     np.testing.assert_allclose(*scores, atol=1e-9)
-    assert len(here) == len(there) > 3
-    others = {one.candidate: one.solution.q for one in there}
-    for one in here:
-        np.testing.assert_allclose(one.solution.q, others[one.candidate], atol=1e-6)
+    assert len(ranked_by_pose) == len(ranked_placed) > 3
+    q_by_candidate = {candidate.candidate: candidate.solution.q for candidate in ranked_placed}
+    for candidate in ranked_by_pose:
+        np.testing.assert_allclose(
+            candidate.solution.q, q_by_candidate[candidate.candidate], atol=1e-6
+        )
     # A candidate that says where its object is moves with it.
-    moved = solver.choose(
+    ranked_moved = solver.choose(
         [cup, *candidates], object_pose=cup.object_pose, limit=50, apart=0, per_candidate=None
     )
     np.testing.assert_allclose(
-        [one.score for one in moved if one.candidate == 0],
-        [one.score for one in moved if one.candidate == 1],
+        [candidate.score for candidate in ranked_moved if candidate.candidate == 0],
+        [candidate.score for candidate in ranked_moved if candidate.candidate == 1],
         atol=1e-6,
     )
 
@@ -118,9 +131,9 @@ def test_answers_are_free_for_coal(careful, robot, candidates, cup):
     (box, place) = table.items["table"].parts[0]
     pose = table.items["table"].pose @ place
     still = careful._engine.check.model.is_fixed
-    for one in ranked:
-        assert one.solution.clearance >= 0
-        links = robot.links(one.solution.q)
+    for choice in ranked:
+        assert choice.solution.clearance >= 0
+        links = robot.links(choice.solution.q)
         for shape in shapes:
             if shape.covers >= 0 or still(shape.link):
                 continue
@@ -132,7 +145,7 @@ def test_answers_are_free_for_coal(careful, robot, candidates, cup):
                 side /= np.linalg.norm(side)
                 turn = np.column_stack([side, np.cross(z, side), z])
             link = links[shape.link]
-            away = coal.distance(
+            separation = coal.distance(
                 coal.Capsule(shape.radius, 2 * length),
                 coal.Transform3s(link[:3, :3] @ turn, link[:3, :3] @ shape.center + link[:3, 3]),
                 coal.Box(*(2 * box.size)),
@@ -140,15 +153,15 @@ def test_answers_are_free_for_coal(careful, robot, candidates, cup):
                 coal.DistanceRequest(True),
                 coal.DistanceResult(),
             )
-            assert away >= -1e-6, shape.link
+            assert separation >= -1e-6, shape.link
 
 
 def test_reasons_are_counted(robot, candidates, cup):
     ball = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3].tolist()}
     solver = ik.Solver(robot, scene=ik.Scene({"balloon": ball}))
-    far = turned(0.0)
-    far[:3, 3] = [5.0, 0.0, 0.0]
-    unreachable = replace(candidates[0].at(far), object_pose=np.eye(4))
+    far_pose = rotated_pose(0.0)
+    far_pose[:3, 3] = [5.0, 0.0, 0.0]
+    unreachable = replace(candidates[0].at(far_pose), object_pose=np.eye(4))
     ranked = solver.choose([*candidates, unreachable], cup.object_pose)
     assert len(ranked) == ranked.answered == 0
     assert sum(ranked.failures.values()) == COUNT + 1
@@ -166,35 +179,38 @@ def test_of_a_given_hand_the_arm_alone_is_ranked(solver, robot, rng):
     q[:, hand] = np.where(rng.random(q[:, hand].shape) < 0.3, robot.upper[hand], q[:, hand])
     grasps = [
         ik.Grasp(
-            palm=robot.palm(one), posture=dict(zip(robot.actuators[hand], one[hand], strict=True))
+            palm=robot.palm(q_row),
+            posture=dict(zip(robot.actuators[hand], q_row[hand], strict=True)),
         )
-        for one in q
+        for q_row in q
     ]
     ranked = solver.choose(grasps, prefer="limits", limit=5)
-    arms = np.stack([one.solution.q for one in ranked])[:, :7]
-    half = (robot.upper - robot.lower)[:7] / 2
-    margins = (np.minimum(arms - robot.lower[:7], robot.upper[:7] - arms) / half).min(axis=1)
-    np.testing.assert_allclose([one.score for one in ranked], margins, atol=1e-12)
+    arms = np.stack([q_row.solution.q for q_row in ranked])[:, :7]
+    half_range = (robot.upper - robot.lower)[:7] / 2
+    margins = (np.minimum(arms - robot.lower[:7], robot.upper[:7] - arms) / half_range).min(axis=1)
+    np.testing.assert_allclose([q_row.score for q_row in ranked], margins, atol=1e-12)
     assert ranked[0].score > 0.2
-    assert len({one.candidate for one in ranked}) == 5
+    assert len({q_row.candidate for q_row in ranked}) == 5
 
 
 def test_a_preference_of_ones_own(solver, robot, candidates, cup):
-    def straight(asked: ik.ArmHand, q: np.ndarray) -> np.ndarray:
-        assert asked.name == robot.name
+    def straight(robot_asked: ik.ArmHand, q: np.ndarray) -> np.ndarray:
+        assert robot_asked.name == robot.name
         return -np.abs(q[:, 0])
 
     ranked = solver.choose(candidates, cup.object_pose, prefer=straight, limit=5)
     np.testing.assert_allclose(
-        [one.score for one in ranked], [-abs(one.solution.q[0]) for one in ranked]
+        [choice.score for choice in ranked], [-abs(choice.solution.q[0]) for choice in ranked]
     )
     usual = solver.choose(candidates, cup.object_pose, limit=5)
-    assert ranked[0].score >= max(-abs(one.solution.q[0]) for one in usual)
+    assert ranked[0].score >= max(-abs(choice.solution.q[0]) for choice in usual)
 
 
 def test_the_arms_measure_and_clearance_rank_too(solver, careful, candidates, cup):
-    for one, prefer in ((solver, "manipulability"), (careful, "clearance")):
-        scores = [c.score for c in one.choose(candidates, cup.object_pose, prefer=prefer)]
+    for ranking_solver, prefer in ((solver, "manipulability"), (careful, "clearance")):
+        scores = [
+            c.score for c in ranking_solver.choose(candidates, cup.object_pose, prefer=prefer)
+        ]
         assert scores == sorted(scores, reverse=True)
         assert scores
         assert scores[0] > 0
@@ -205,8 +221,8 @@ def test_grasps_with_other_fingers_rank_together(solver, candidates, cup):
         {name: candidates[0].contacts[name] for name in ("thumb", "finger_2")}, object=cup.object
     )
     ranked = solver.choose([*candidates, pinch], cup.object_pose, limit=100, apart=0)
-    assert COUNT in {one.candidate for one in ranked}
-    assert 0 in {one.candidate for one in ranked}
+    assert COUNT in {choice.candidate for choice in ranked}
+    assert 0 in {choice.candidate for choice in ranked}
 
 
 def test_bad_questions_are_one_clear_line(solver, robot, candidates, cup):

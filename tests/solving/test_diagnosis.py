@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from robot_variants import derived_robot
 from scipy.optimize import least_squares
-from toy_robots import moved
+from toy_robots import moved_targets
 
 import casadi_ik as ik
 
@@ -126,10 +126,10 @@ def test_normal_that_faces_away(
     }
     for item in diagnosis.freed:
         p, n = robot.contacts(item.q)
-        rest = [i for i, name in enumerate(robot.fingers) if name != item.finger]
-        assert np.linalg.norm((p - points)[rest], axis=1).max() <= 5e-3 * (1 + 1e-9)
+        other_columns = [i for i, name in enumerate(robot.fingers) if name != item.finger]
+        assert np.linalg.norm((p - points)[other_columns], axis=1).max() <= 5e-3 * (1 + 1e-9)
         if item.finger != "all":
-            assert np.linalg.norm((n - normals)[rest], axis=1).max() <= np.deg2rad(3)
+            assert np.linalg.norm((n - normals)[other_columns], axis=1).max() <= np.deg2rad(3)
 
 
 def test_a_grasp_that_says_where_its_object_is(solver: ik.Solver) -> None:
@@ -138,9 +138,9 @@ def test_a_grasp_that_says_where_its_object_is(solver: ik.Solver) -> None:
     up = np.eye(4)
     up[2, 3] = 0.15
     contacts = {**grasp.contacts, "finger_2": grasp.contacts["finger_2"].at(up)}
-    asked = replace(grasp, contacts=contacts)
-    assert asked.object_pose is not None
-    diagnosis = solver.solve(asked).diagnosis
+    grasp_with_object = replace(grasp, contacts=contacts)
+    assert grasp_with_object.object_pose is not None
+    diagnosis = solver.solve(grasp_with_object).diagnosis
     assert diagnosis is not None
     assert ("finger", "finger_2") in {(item.part, item.finger) for item in diagnosis.freed}
     up[2, 3] = 0.02
@@ -153,12 +153,12 @@ def test_one_limit_blocks(solver: ik.Solver, robot: ik.ArmHand) -> None:
     Every relief is proved by its solution, and asks for no more than those 5 degrees.
     """
     rng = np.random.default_rng(3)
-    middle, half = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
+    middle, half_range = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
     names, blocked = ["lwr_joint_4", "bh_thumb_proximal", "bh_finger_2_distal"], 0
     for name in names:
         j = robot.actuators.index(name)
         for _ in range(4):
-            q = middle + 0.5 * half * rng.uniform(-1, 1, len(half))
+            q = middle + 0.5 * half_range * rng.uniform(-1, 1, len(half_range))
             q[j] = robot.upper[j] + np.deg2rad(5)
             points, normals = robot.contacts(q)
             strict = ik.Solver(robot, tolerance=ik.Tolerance(5e-4, np.deg2rad(0.3)))
@@ -194,7 +194,7 @@ def test_barely_reachable_is_never_unreachable(solver: ik.Solver, robot: ik.ArmH
 def test_reachable_thanks_to_tolerance(solver: ik.Solver, robot: ik.ArmHand) -> None:
     rng = np.random.default_rng(12)
     for q in (at_limits(robot, rng, 250, 0.3), stretched(robot, rng, 250)):
-        targets = moved(robot.contacts(q), rng, 0.99 * 5e-3, 0.99 * np.deg2rad(3))
+        targets = moved_targets(robot.contacts(q), rng, 0.99 * 5e-3, 0.99 * np.deg2rad(3))
         batch = solver.solve_batch(*targets, diagnose=True)
         assert "UNREACHABLE" not in batch.status_names
         assert batch.success.mean() > 0.99
@@ -219,8 +219,8 @@ def test_agrees_with_brute_force(solver: ik.Solver, robot: ik.ArmHand) -> None:
         target = points[row], normals[row]
         best = best_of_restarts(robot, *target, diagnosis.q)
         assert largest_part(robot, *target, best) > 1
-        found = np.linalg.norm(residual(best, robot, *target))
-        ratios.append(np.linalg.norm(residual(diagnosis.q, robot, *target)) / found)
+        norm = np.linalg.norm(residual(best, robot, *target))
+        ratios.append(np.linalg.norm(residual(diagnosis.q, robot, *target)) / norm)
     assert np.median(ratios) < 1.01
     assert np.quantile(ratios, 0.9) < 1.5
 
@@ -235,8 +235,8 @@ def test_other_methods_ask_hand_first(robot: ik.ArmHand, cup: tuple[Array, Array
     assert solution.diagnosis is not None
     assert solution.diagnosis.reason is ik.solve.Reason.REACHABLE
     assert "hand-first solves" in solution.diagnosis.lines[1]
-    far = paper.solve_batch(cup[0][None] + 3.0, cup[1][None], diagnose=True)
-    assert far.status_names.tolist() == ["UNREACHABLE"]
+    far_batch = paper.solve_batch(cup[0][None] + 3.0, cup[1][None], diagnose=True)
+    assert far_batch.status_names.tolist() == ["UNREACHABLE"]
 
 
 def test_nearest_contacts(solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
@@ -244,19 +244,19 @@ def test_nearest_contacts(solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array
     diagnosis = diagnosed(solver, cup[0] + [0.5, 0, 0], cup[1])
     points, normals = robot.contacts(diagnosis.q)
     for i, name in enumerate(robot.fingers):
-        near = diagnosis.nearest[name]
-        np.testing.assert_allclose(near.point, points[i])
-        np.testing.assert_allclose(near.normal, normals[i])
-        assert near.position_error == pytest.approx(
+        nearest_contact = diagnosis.nearest[name]
+        np.testing.assert_allclose(nearest_contact.point, points[i])
+        np.testing.assert_allclose(nearest_contact.normal, normals[i])
+        assert nearest_contact.position_error == pytest.approx(
             np.linalg.norm(points[i] - cup[0][i] - [0.5, 0, 0])
         )
     assert np.all((diagnosis.q >= robot.lower) & (diagnosis.q <= robot.upper))
     enough = replace(diagnosis.enough, position=diagnosis.enough.position * 1.001)
     enough = replace(enough, angle=enough.angle * 1.001)
-    again = ik.Solver(robot, tolerance=enough).solve_batch(
+    batch_at_nearest = ik.Solver(robot, tolerance=enough).solve_batch(
         cup[0][None] + [0.5, 0, 0], cup[1][None], diagnose=True
     )
-    assert again.success.all()
+    assert batch_at_nearest.success.all()
 
 
 def impossible(robot: ik.ArmHand, count: int) -> tuple[Array, Array]:
@@ -272,18 +272,18 @@ def impossible(robot: ik.ArmHand, count: int) -> tuple[Array, Array]:
 
 def test_in_a_batch_as_alone(solver: ik.Solver, robot: ik.ArmHand) -> None:
     points, normals = impossible(robot, 4)
-    whole = solver.solve_batch(points, normals, diagnose=True)
+    batch = solver.solve_batch(points, normals, diagnose=True)
     threads = solver.solve_batch(points, normals, diagnose=True, jobs=2)
-    assert (~whole.success).sum() >= 10
-    for row, one in enumerate(whole.diagnoses):
+    assert (~batch.success).sum() >= 10
+    for row, diagnosis in enumerate(batch.diagnoses):
         target = points[row : row + 1], normals[row : row + 1]
-        alone = solver.solve_batch(*target, diagnose=True).diagnoses[0]
-        for other in (alone, threads.diagnoses[row]):
-            assert (one is None) == (other is None)
-            if one is None or other is None:
+        single_diagnosis = solver.solve_batch(*target, diagnose=True).diagnoses[0]
+        for expected_diagnosis in (single_diagnosis, threads.diagnoses[row]):
+            assert (diagnosis is None) == (expected_diagnosis is None)
+            if diagnosis is None or expected_diagnosis is None:
                 continue
-            assert one.lines == other.lines
-            np.testing.assert_array_equal(one.q, other.q)
+            assert diagnosis.lines == expected_diagnosis.lines
+            np.testing.assert_array_equal(diagnosis.q, expected_diagnosis.q)
 
 
 def test_pickled_with_what_would_help(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
@@ -354,13 +354,13 @@ def test_free_finger(robot: ik.ArmHand, cup: tuple[Array, Array], finger: int) -
 
     points, normals = cup[0][None] - [1.0, 0, 0], cup[1][None].copy()
     points[:, finger], normals[:, finger] = np.nan, np.nan
-    far = batch_of(solver, points, normals)
-    (why,) = far.diagnoses
-    assert far.status_names.tolist() == ["UNREACHABLE"]
-    assert why is not None
-    assert why.reason is ik.solve.Reason.REACH
-    assert np.isnan(why.nearest[robot.fingers[finger]].position_error)
-    assert robot.fingers[finger] not in {item.finger for item in why.freed}
+    far_batch = batch_of(solver, points, normals)
+    (diagnosis,) = far_batch.diagnoses
+    assert far_batch.status_names.tolist() == ["UNREACHABLE"]
+    assert diagnosis is not None
+    assert diagnosis.reason is ik.solve.Reason.REACH
+    assert np.isnan(diagnosis.nearest[robot.fingers[finger]].position_error)
+    assert robot.fingers[finger] not in {item.finger for item in diagnosis.freed}
 
 
 def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
@@ -375,12 +375,12 @@ def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
         assert batch.success.all(), batch.status_names[~batch.success]
 
     closed = batch_of(solver, cup[0][None], cup[1][None], fixed={"bh_spread": 2.5})
-    (why,) = closed.diagnoses
+    (diagnosis,) = closed.diagnoses
     assert set(closed.status_names) <= {"UNREACHABLE", "NOT_FOUND"}
-    assert why is not None
-    assert why.reason is ik.solve.Reason.HAND
-    assert why.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)
-    for relief in why.reliefs:
+    assert diagnosis is not None
+    assert diagnosis.reason is ik.solve.Reason.HAND
+    assert diagnosis.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)
+    for relief in diagnosis.reliefs:
         assert "bh_spread" not in relief.beyond
         assert relief.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)
 
@@ -394,19 +394,19 @@ def test_arm_without_a_closed_form(bent: ik.ArmHand) -> None:
 
     points, normals = bent.contacts(bent.home)
     wide = points + 0.25 * np.array([[0, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    (why,) = batch_of(solver, wide[None], normals[None]).diagnoses
-    assert why is not None
-    assert why.reason is ik.solve.Reason.HAND
-    assert why.established
+    (diagnosis,) = batch_of(solver, wide[None], normals[None]).diagnoses
+    assert diagnosis is not None
+    assert diagnosis.reason is ik.solve.Reason.HAND
+    assert diagnosis.established
 
     # What such an arm can span is not known: too far is seen, but not called by its name.
-    far = batch_of(solver, points[None] + [3.0, 0, 0], normals[None])
-    (why,) = far.diagnoses
-    assert not far.success[0]
-    assert why is not None
-    assert why.reach is None
-    assert why.reason is not ik.solve.Reason.HAND
-    assert why.enough.position > 1.0
+    far_batch = batch_of(solver, points[None] + [3.0, 0, 0], normals[None])
+    (diagnosis,) = far_batch.diagnoses
+    assert not far_batch.success[0]
+    assert diagnosis is not None
+    assert diagnosis.reach is None
+    assert diagnosis.reason is not ik.solve.Reason.HAND
+    assert diagnosis.enough.position > 1.0
 
 
 def test_a_bad_start_never_makes_it_unreachable(robot: ik.ArmHand) -> None:
@@ -420,8 +420,8 @@ def test_a_bad_start_never_makes_it_unreachable(robot: ik.ArmHand) -> None:
     )
     batch = hasty.solve_batch(points, normals, diagnose=True)
     assert not batch.success.any()
-    found = [diagnosis for diagnosis in batch.diagnoses if diagnosis is not None]
-    assert len(found) == len(q)
-    assert {diagnosis.reason for diagnosis in found} == {ik.solve.Reason.REACHABLE}
-    reached, _ = robot.contacts(np.stack([diagnosis.q for diagnosis in found]))
-    assert np.linalg.norm(reached - points, axis=2).max() < 5.01e-3
+    diagnoses = [diagnosis for diagnosis in batch.diagnoses if diagnosis is not None]
+    assert len(diagnoses) == len(q)
+    assert {diagnosis.reason for diagnosis in diagnoses} == {ik.solve.Reason.REACHABLE}
+    points_reached, _ = robot.contacts(np.stack([diagnosis.q for diagnosis in diagnoses]))
+    assert np.linalg.norm(points_reached - points, axis=2).max() < 5.01e-3

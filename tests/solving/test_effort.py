@@ -13,7 +13,7 @@ CANDIDATES = 8
 
 
 @pytest.fixture(scope="module")
-def far(robot):
+def far_targets(robot):
     """Contacts that can nearly be reached, and some that can."""
     rng = np.random.default_rng(7)
     points, normals = robot.contacts(robot.random(rng, 60))
@@ -21,20 +21,20 @@ def far(robot):
     return points, normals
 
 
-def test_rounds_are_limited(robot, far):
-    usual = ik.Solver(robot).solve_batch(*far)
+def test_rounds_are_limited(robot, far_targets):
+    usual = ik.Solver(robot).solve_batch(*far_targets)
     solver = ik.Solver(robot, options={"max_rounds": 1})
-    batch, fast = solver.solve_batch(*far), solver.fast()
+    batch, fast = solver.solve_batch(*far_targets), solver.fast()
     assert usual.restarts.max() >= CANDIDATES
     assert batch.restarts.max() < CANDIDATES
     assert batch.success[30:].all()
     for q0 in (None, robot.home):
-        near = solver.solve_batch(*far, q0=q0)
-        assert near.restarts.max() < CANDIDATES
+        near_batch = solver.solve_batch(*far_targets, q0=q0)
+        assert near_batch.restarts.max() < CANDIDATES
         for row in range(40):
-            q, status = fast(far[0][row], far[1][row], q0)
-            assert status == near.status[row]
-            np.testing.assert_array_equal(q, near.q[row])
+            q, status = fast(far_targets[0][row], far_targets[1][row], q0)
+            assert status == near_batch.status[row]
+            np.testing.assert_array_equal(q, near_batch.q[row])
 
 
 def test_what_is_no_limit(robot):
@@ -75,12 +75,12 @@ def test_postures_are_names_or_whole_configurations(robot, rng):
         solver.solve_palms(palms, "open")
 
 
-def test_an_answer_of_fast_stays(robot, far):
+def test_an_answer_of_fast_stays(robot, far_targets):
     fast = ik.Solver(robot).fast()
-    first, _ = fast(far[0][40], far[1][40])
-    kept = first.copy()
-    fast(far[0][41], far[1][41])
-    np.testing.assert_array_equal(first, kept)
+    first, _ = fast(far_targets[0][40], far_targets[1][40])
+    answer_before = first.copy()
+    fast(far_targets[0][41], far_targets[1][41])
+    np.testing.assert_array_equal(first, answer_before)
 
 
 def test_q0_in_degrees_is_noticed(robot):

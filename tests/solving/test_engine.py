@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import pytest
 from toy_robots import grasp_at, replace
-from trace_checks import Kept
+from trace_checks import TraceRecorder
 
 import casadi_ik as ik
 from casadi_ik.model.targets import TargetBatch
@@ -74,11 +74,13 @@ def test_the_verdict_outvotes_the_method(robot, status):
 def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
     """In parts, with the rows of their own iterations."""
     points, normals = robot.contacts(robot.random(rng, 300))
-    kept = Kept()
-    batch = ik.Solver(robot).solve_batch(points, normals, jobs=jobs, log=kept)
-    assert len(kept.blocks) > 1
-    assert sorted(i for b in kept.blocks for i in range(b.first, b.first + len(b))) == [*range(300)]
-    for block in kept.blocks:
+    recorder = TraceRecorder()
+    batch = ik.Solver(robot).solve_batch(points, normals, jobs=jobs, log=recorder)
+    assert len(recorder.blocks) > 1
+    assert sorted(i for b in recorder.blocks for i in range(b.first, b.first + len(b))) == [
+        *range(300)
+    ]
+    for block in recorder.blocks:
         rows = slice(block.first, block.first + len(block))
         np.testing.assert_array_equal(block.batch.q, batch.q[rows])
         np.testing.assert_array_equal(block.targets.points, points[rows])
@@ -89,13 +91,13 @@ def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
 
 def test_a_quick_answer_has_every_field(robot: ik.ArmHand) -> None:
     solution = ik.Solver(robot).solve(grasp_at(robot, robot.home))
-    for one in (solution, *solution.contacts.values()):
-        needed = {f.name for f in dataclasses.fields(one) if f.default is dataclasses.MISSING}
-        names = {f.name for f in dataclasses.fields(one)}
-        assert needed <= vars(one).keys() <= names
-        for again in (dataclasses.replace(one), pickle.loads(pickle.dumps(one))):
+    for result in (solution, *solution.contacts.values()):
+        needed = {f.name for f in dataclasses.fields(result) if f.default is dataclasses.MISSING}
+        names = {f.name for f in dataclasses.fields(result)}
+        assert needed <= vars(result).keys() <= names
+        for copied in (dataclasses.replace(result), pickle.loads(pickle.dumps(result))):
             for name in names:
-                assert repr(getattr(again, name)) == repr(getattr(one, name))
+                assert repr(getattr(copied, name)) == repr(getattr(result, name))
 
 
 def problems(points, normals, **tolerance):
@@ -112,21 +114,21 @@ def test_edge_of_the_tolerances(robot):
         across /= np.linalg.norm(across)
         turn = np.radians(angle)
         normals[row, 1] = np.cos(turn) * normals[row, 1] + np.sin(turn) * across
-    found = judge(robot, problems(points, normals), q)
-    np.testing.assert_array_equal(found.ok[:, 0], [True, False, True, True])
-    np.testing.assert_array_equal(found.ok[:, 1], [True, True, True, False])
-    np.testing.assert_allclose(found.angle_error[2:, 1], np.radians([2.99, 3.01]), rtol=1e-9)
+    verdicts = judge(robot, problems(points, normals), q)
+    np.testing.assert_array_equal(verdicts.ok[:, 0], [True, False, True, True])
+    np.testing.assert_array_equal(verdicts.ok[:, 1], [True, True, True, False])
+    np.testing.assert_allclose(verdicts.angle_error[2:, 1], np.radians([2.99, 3.01]), rtol=1e-9)
 
 
 def test_small_and_opposite_angles_are_exact(robot):
     points, normals = (x[None] for x in robot.contacts(robot.home))
     tiny = 1e-9
     across = np.cross(normals[0, 0], [0.3, 0.4, 0.5])
-    turned = normals.copy()
-    turned[0, 0] = normals[0, 0] + tiny * across / np.linalg.norm(across)
-    turned[0, 1] = -normals[0, 1]
-    found = judge(robot, problems(points, turned), robot.home[None])
-    np.testing.assert_allclose(found.angle_error[0, :2], [tiny, np.pi], rtol=1e-6)
+    turned_normals = normals.copy()
+    turned_normals[0, 0] = normals[0, 0] + tiny * across / np.linalg.norm(across)
+    turned_normals[0, 1] = -normals[0, 1]
+    verdicts = judge(robot, problems(points, turned_normals), robot.home[None])
+    np.testing.assert_allclose(verdicts.angle_error[0, :2], [tiny, np.pi], rtol=1e-6)
 
 
 def limits_ok(robot, q):
@@ -138,10 +140,10 @@ def test_what_is_free_is_met(robot):
     points, normals = (x[None].copy() for x in robot.contacts(robot.home))
     points[0, 0] = normals[0, 0] = normals[0, 1] = np.nan
     points[0, 2] += 1.0
-    found = judge(robot, problems(points, normals), robot.home[None])
-    np.testing.assert_array_equal(found.ok[0], [True, True, False])
-    assert np.isnan(found.position_error[0, 0])
-    assert np.isnan(found.angle_error[0, :2]).all()
+    verdicts = judge(robot, problems(points, normals), robot.home[None])
+    np.testing.assert_array_equal(verdicts.ok[0], [True, True, False])
+    assert np.isnan(verdicts.position_error[0, 0])
+    assert np.isnan(verdicts.angle_error[0, :2]).all()
 
 
 def test_limits_of_every_motor(robot):

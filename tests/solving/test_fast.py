@@ -26,10 +26,10 @@ def targets(robot):
 
 
 @pytest.mark.parametrize("limits", ["enforce", "ignore"])
-@pytest.mark.parametrize("near", [False, True])
-def test_bit_for_bit_as_in_a_batch(robot, targets, limits, near):
+@pytest.mark.parametrize("starts_near", [False, True])
+def test_bit_for_bit_as_in_a_batch(robot, targets, limits, starts_near):
     solver = ik.Solver(robot, tolerance=ik.Tolerance(1e-6, 1e-6), limits=limits)
-    q0 = robot.home + 0.01 if near else None
+    q0 = robot.home + 0.01 if starts_near else None
     fast, batch = solver.fast(), solver.solve_batch(*targets, q0=q0)
     assert batch.restarts.max() > 380, "no target went through all rounds"
     for row, target in enumerate(zip(*targets, strict=True)):
@@ -49,8 +49,8 @@ def test_one_instance_per_thread(robot, targets):
         return np.array([fast(*target)[0].copy() for target in zip(*targets, strict=True)])
 
     with ThreadPoolExecutor(3) as pool:
-        for found in pool.map(solve, range(3)):
-            np.testing.assert_array_equal(found, expected)
+        for answers in pool.map(solve, range(3)):
+            np.testing.assert_array_equal(answers, expected)
 
 
 @pytest.mark.parametrize(

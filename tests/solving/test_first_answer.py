@@ -45,15 +45,18 @@ def loops(cache: Path) -> list[Path]:
 
 def workers(cache: Path) -> list[int]:
     """Processes that compile into a cache."""
-    found = []
+    workers_found = []
     for place in Path("/proc").glob("[0-9]*"):
         try:
-            about = (place / "environ").read_bytes(), (place / "cmdline").read_bytes()
+            process_files = (place / "environ").read_bytes(), (place / "cmdline").read_bytes()
         except OSError:
             continue
-        if f"CASADI_IK_CACHE={cache}\0".encode() in about[0] and b"first_answer" in about[1]:
-            found.append(int(place.name))
-    return found
+        if (
+            f"CASADI_IK_CACHE={cache}\0".encode() in process_files[0]
+            and b"first_answer" in process_files[1]
+        ):
+            workers_found.append(int(place.name))
+    return workers_found
 
 
 @pytest.mark.slow
@@ -61,10 +64,10 @@ def workers(cache: Path) -> list[int]:
 def test_the_virtual_machine_answers_until_there_is_compiled_code(
     tmp_path: Path, scene: str
 ) -> None:
-    early, said = run(tmp_path, "background", scene)
-    assert said.startswith("kuka_lwr_barrett: ")
-    assert "background (about 6 s" in said
-    assert said.count("\n") == 1
+    early, lines = run(tmp_path, "background", scene)
+    assert lines.startswith("kuka_lwr_barrett: ")
+    assert "background (about 6 s" in lines
+    assert lines.count("\n") == 1
     if not Path("/proc/self/environ").exists():
         pytest.skip("how processes are found is Linux's")
     until = time.monotonic() + 500
@@ -72,8 +75,8 @@ def test_the_virtual_machine_answers_until_there_is_compiled_code(
         time.sleep(0.2)
     assert len(loops(tmp_path)) == 2  # one after the other, and side by side
     assert not list(tmp_path.glob("build-*"))
-    late, said = run(tmp_path, "background", scene)
-    assert said == ""
+    late, lines = run(tmp_path, "background", scene)
+    assert lines == ""
     np.testing.assert_allclose(late, early, rtol=0, atol=1e-9)
 
 
@@ -83,8 +86,8 @@ def test_a_compilation_in_the_background_may_be_killed(tmp_path: Path) -> None:
     early, _ = run(tmp_path, "background")
     for number in workers(tmp_path):
         os.killpg(number, signal.SIGKILL)
-    late, said = run(tmp_path, "wait")
-    assert said == ""
+    late, lines = run(tmp_path, "wait")
+    assert lines == ""
     np.testing.assert_allclose(late, early, rtol=0, atol=1e-9)
     assert loops(tmp_path)
 
@@ -99,8 +102,8 @@ def test_what_the_first_round_does_not_solve_waits(
     expected = ik.Solver(robot).solve(grasp)
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
     monkeypatch.setenv("CASADI_IK_COMPILE", "background")
-    found = ik.Solver(robot).solve(grasp)
-    assert (found.status, found.q.tobytes()) == (expected.status, expected.q.tobytes())
+    solution = ik.Solver(robot).solve(grasp)
+    assert (solution.status, solution.q.tobytes()) == (expected.status, expected.q.tobytes())
     for number in workers(tmp_path):
         os.killpg(number, signal.SIGKILL)
 
@@ -113,9 +116,9 @@ def test_nothing_is_compiled_later(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def through_all_uses() -> list[str]:
         forget(monkeypatch)
         done = []
-        for what, use in uses(ik.load_robot("ar10"), everything=True):
+        for use_name, use in uses(ik.load_robot("ar10"), everything=True):
             use()
-            done.append(what)
+            done.append(use_name)
         return done
 
     done = through_all_uses()

@@ -32,16 +32,16 @@ def test_a_palm_is_where_it_was_asked_for_though_its_contacts_leave_it_free(name
     assert batch.success.all()
     np.testing.assert_allclose(robot.palm(batch.q), robot.palm(q), atol=1e-6)
     posture = {motor: float(values[0]) for motor, values in hand.items()}
-    one = ik.Grasp(palm=robot.palm(q[0]), posture=posture)
-    assert solver.solve(one).palm.ok
-    assert solver.choose([one], limit=2).answered == 1
+    palm_grasp = ik.Grasp(palm=robot.palm(q[0]), posture=posture)
+    assert solver.solve(palm_grasp).palm.ok
+    assert solver.choose([palm_grasp], limit=2).answered == 1
 
 
 def test_a_palm_out_of_reach_is_diagnosed_as_one():
     robot, solver = robot_of("panda+panda_hand"), solver_of("panda+panda_hand")
-    far = robot.palm(robot.home)
-    far[0, 3] += 2.0
-    solution = solver.solve(ik.Grasp(palm=far, posture={"panda_finger_1": 0.02}))
+    far_palm = robot.palm(robot.home)
+    far_palm[0, 3] += 2.0
+    solution = solver.solve(ik.Grasp(palm=far_palm, posture={"panda_finger_1": 0.02}))
     assert solution.status is ik.Status.UNREACHABLE
     assert solution.diagnosis.palm is not None
 
@@ -56,11 +56,13 @@ def test_what_contacts_leave_free_is_searched(name, fingers, count):
     robot, solver = robot_of(name), solver_of(name)
     points, normals = robot.contacts(robot.random(np.random.default_rng(11), count))
     if fingers == 1:
-        others = np.arange(len(robot.fingers)) != np.arange(count)[:, None] % len(robot.fingers)
-        points[others] = normals[others] = np.nan
+        other_fingers = np.arange(len(robot.fingers)) != np.arange(count)[:, None] % len(
+            robot.fingers
+        )
+        points[other_fingers] = normals[other_fingers] = np.nan
     assert solver.solve_batch(points, normals).success.all()
-    alone = ik.Solver(robot, compiled=False)
-    assert alone.solve_batch(points[-10:], normals[-10:]).success.all()
+    plain_solver = ik.Solver(robot, compiled=False)
+    assert plain_solver.solve_batch(points[-10:], normals[-10:]).success.all()
 
 
 @pytest.mark.parametrize("name", GRIPPERS)
@@ -73,8 +75,8 @@ def test_what_a_hand_of_one_motor_misses_is_diagnosed(name):
     batch = solver.solve_batch(points, askew, diagnose=True)
     assert batch.success.any()
     assert not batch.success.all()
-    for solved, why in zip(batch.success, batch.diagnoses, strict=True):
-        assert solved == (why is None)
+    for solved, diagnosis in zip(batch.success, batch.diagnoses, strict=True):
+        assert solved == (diagnosis is None)
 
 
 @pytest.mark.slow
@@ -89,10 +91,10 @@ def test_an_arm_with_a_tool():
     solution = solver.solve(ik.Grasp({"tip": tip}))
     np.testing.assert_allclose(robot.contact_frames(solution.q)[0], frame, atol=1e-2)
     assert len(solver.solve_all(ik.Grasp({"tip": tip}))) > 1
-    far = solver.solve(ik.Grasp({"tip": ik.Contact(tip.point + 3.0, tip.normal)}))
-    assert far.status is ik.Status.UNREACHABLE
+    far_solution = solver.solve(ik.Grasp({"tip": ik.Contact(tip.point + 3.0, tip.normal)}))
+    assert far_solution.status is ik.Status.UNREACHABLE
     batch = solver.solve_batch(1.25 * points[:20], normals[:20], diagnose=True)
-    assert [why is None for why in batch.diagnoses] == batch.success.tolist()
+    assert [diagnosis is None for diagnosis in batch.diagnoses] == batch.success.tolist()
 
 
 def test_a_chain_that_is_one_finger(tmp_path: Path) -> None:

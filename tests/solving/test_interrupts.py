@@ -64,7 +64,7 @@ def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -
 def test_a_stream_has_handed_over_what_is_finished(robot) -> None:
     points, normals = robot.contacts(robot.random(np.random.default_rng(0), 30))
     solver = ik.Solver(robot)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    handler_before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def blocks():
         for start in range(0, 30, 10):
@@ -73,14 +73,14 @@ def test_a_stream_has_handed_over_what_is_finished(robot) -> None:
                 time.sleep(5)
             yield points[start : start + 10], normals[start : start + 10]
 
-    kept = []
+    finished_blocks = []
     try:
         with pytest.raises(KeyboardInterrupt):
-            kept.extend(solver.solve_blocks(blocks(), jobs=2))
+            finished_blocks.extend(solver.solve_blocks(blocks(), jobs=2))
     finally:
-        signal.signal(signal.SIGINT, before)
-    assert [block.first_row for block in kept] == [0, 10]
-    assert all(block.solution.success.all() for block in kept)
+        signal.signal(signal.SIGINT, handler_before)
+    assert [block.first_row for block in finished_blocks] == [0, 10]
+    assert all(block.solution.success.all() for block in finished_blocks)
 
 
 def test_an_error_stops_the_others() -> None:

@@ -33,10 +33,10 @@ def test_along_paths_of_small_steps_nothing_jumps(robot, rng):
     """It was up to 208 degrees."""
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
     for _ in range(4):
-        wanted = path(robot, rng, 40)
-        q = wanted[0]
-        for one in wanted[1:]:
-            points, normals = robot.contacts(one)
+        path_targets = path(robot, rng, 40)
+        q = path_targets[0]
+        for target in path_targets[1:]:
+            points, normals = robot.contacts(target)
             batch = solver.solve_batch(points[None], normals[None], q0=q)
             assert batch.success.all()
             assert np.abs(batch.q[0] - q).max() < np.radians(3)
@@ -46,24 +46,24 @@ def test_along_paths_of_small_steps_nothing_jumps(robot, rng):
 def test_every_target_is_solved_from_anywhere_and_nearer_than_without_preference(robot, rng):
     q, q0 = robot.random(rng, 300), robot.random(rng, 300)
     solver, targets = ik.Solver(robot, tolerance=EXACT, compiled=False), robot.contacts(q)
-    near = solver.solve_batch(*targets, q0=q0)
-    far = solver.solve_batch(*targets, q0=q0, prefer="limits")
-    assert near.success.all()
-    assert far.success.all()
-    nearer = distance(robot, near.q, q0) <= distance(robot, far.q, q0) + 1e-6
+    near_batch = solver.solve_batch(*targets, q0=q0)
+    limits_batch = solver.solve_batch(*targets, q0=q0, prefer="limits")
+    assert near_batch.success.all()
+    assert limits_batch.success.all()
+    nearer = distance(robot, near_batch.q, q0) <= distance(robot, limits_batch.q, q0) + 1e-6
     assert nearer.mean() > 0.98
-    np.testing.assert_array_equal(far.q, solver.solve_batch(*targets).q)
+    np.testing.assert_array_equal(limits_batch.q, solver.solve_batch(*targets).q)
 
 
 def test_nearest_of_those_that_are_seen(robot, rng):
     q, q0 = robot.random(rng, 12), robot.random(rng, 12)
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
     batch = solver.solve_batch(*robot.contacts(q), q0=q0)
-    found = [
-        solver.solve_all(grasp_at(robot, one), prefer="q0", q0=start, limit=1)[0].distance
-        for one, start in zip(q, q0, strict=True)
+    min_distances = [
+        solver.solve_all(grasp_at(robot, q_row), prefer="q0", q0=start, limit=1)[0].distance
+        for q_row, start in zip(q, q0, strict=True)
     ]
-    ratio = distance(robot, batch.q, q0) / np.array(found)
+    ratio = distance(robot, batch.q, q0) / np.array(min_distances)
     assert np.median(ratio) < 1.01
 
 

@@ -24,8 +24,8 @@ def solver_of(robot: str, scene: str) -> ik.Solver:
 
 
 def preferences(solver):
-    known = (None, "q0", "limits", "manipulability")
-    return known if solver.scene is None else (*known, "clearance")
+    builtin_preferences = (None, "q0", "limits", "manipulability")
+    return builtin_preferences if solver.scene is None else (*builtin_preferences, "clearance")
 
 
 def starts(robot, rng):
@@ -46,40 +46,42 @@ def targets(solver, rng):
     return points, normals, q
 
 
-some = settings(max_examples=6, derandomize=True, deadline=None)
-asked = given(
+few_examples = settings(max_examples=6, derandomize=True, deadline=None)
+random_targets = given(
     seed=st.integers(0, 2**32 - 1), robot=st.sampled_from(ROBOTS), scene=st.sampled_from([*SCENES])
 )
 
 
 @pytest.mark.slow
-@some
-@asked
+@few_examples
+@random_targets
 def test_solved_is_the_same_whatever_is_preferred(seed, robot, scene):
     solver, rng = solver_of(robot, scene), np.random.default_rng(seed)
     points, normals, truth = targets(solver, rng)
-    every = starts(solver.robot, rng)
+    all_starts = starts(solver.robot, rng)
     usual = solver.solve_batch(points, normals)
     grasps = grasps_of(solver.robot, points, normals)
-    found = {name: solver.solve_batch(points, normals, q0=q0).success for name, q0 in every.items()}
-    for prefer, (name, q0) in product(preferences(solver), every.items()):
+    success = {
+        name: solver.solve_batch(points, normals, q0=q0).success for name, q0 in all_starts.items()
+    }
+    for prefer, (name, q0) in product(preferences(solver), all_starts.items()):
         batch = solver.solve_batch(points, normals, q0=q0, prefer=prefer)
-        assert batch.success.tolist() == found[name].tolist(), (prefer, name)
+        assert batch.success.tolist() == success[name].tolist(), (prefer, name)
         side = solver.solve_batch(points, normals, q0=q0, prefer=prefer, jobs=2)
-        assert side.success.tolist() == found[name].tolist(), (prefer, name)
-        assert found[name].tolist() == usual.success.tolist(), name
+        assert side.success.tolist() == success[name].tolist(), (prefer, name)
+        assert success[name].tolist() == usual.success.tolist(), name
     for prefer, row in product(preferences(solver), range(0, COUNT, 3)):
-        alone = solver.solve(grasps[row], q0=every["random"], prefer=prefer, diagnose=False)
-        assert alone.success == found["random"][row], prefer
+        solution = solver.solve(grasps[row], q0=all_starts["random"], prefer=prefer, diagnose=False)
+        assert solution.success == success["random"][row], prefer
     # A start that is an answer says more than the target does: it may add, and never costs one.
-    told = solver.solve_batch(points, normals, q0=truth)
-    assert not (usual.success & ~told.success).any()
-    assert told.success[:-2].sum() >= usual.success[:-2].sum()
+    batch_from_truth = solver.solve_batch(points, normals, q0=truth)
+    assert not (usual.success & ~batch_from_truth.success).any()
+    assert batch_from_truth.success[:-2].sum() >= usual.success[:-2].sum()
 
 
 @pytest.mark.slow
-@some
-@asked
+@few_examples
+@random_targets
 def test_choose_answers_as_many_candidates(seed, robot, scene):
     solver, rng = solver_of(robot, scene), np.random.default_rng(seed)
     points, normals, _ = targets(solver, rng)
@@ -90,7 +92,7 @@ def test_choose_answers_as_many_candidates(seed, robot, scene):
             ranked = solver.choose(grasps, q0=q0, prefer=prefer, limit=limit)
             assert ranked.answered == usual.answered, (prefer, q0)
             assert ranked.failures == usual.failures, (prefer, q0)
-            assert len({one.candidate for one in ranked}) == len(ranked)
+            assert len({choice.candidate for choice in ranked}) == len(ranked)
 
 
 @pytest.mark.slow
@@ -105,12 +107,12 @@ def test_what_cannot_be_reached_near_q0_is_looked_for_elsewhere(robot):
     assert 50 < usual.sum() < 400
     fast = solver.fast()
     for q0 in starts(solver.robot, rng).values():
-        near = solver.solve_batch(points, normals, q0=q0)
-        assert not (usual & ~near.success).any()
+        near_batch = solver.solve_batch(points, normals, q0=q0)
+        assert not (usual & ~near_batch.success).any()
         for row in np.flatnonzero(~usual)[:20]:
             q, status = fast(points[row], normals[row], q0)
-            assert status == near.status[row]
-            np.testing.assert_array_equal(q, near.q[row])
+            assert status == near_batch.status[row]
+            np.testing.assert_array_equal(q, near_batch.q[row])
 
 
 @pytest.mark.slow
@@ -118,8 +120,8 @@ def test_what_cannot_be_reached_near_q0_is_looked_for_elsewhere(robot):
 @pytest.mark.parametrize("prefer", ["q0", "limits", "manipulability", "clearance"])
 def test_a_shipped_grasp_on_the_table(grasp, prefer):
     """With "q0" it was COLLISION: one hand was looked at, again and again."""
-    asked = ik.load_grasp(grasp)
-    solution = solver_of(asked.robot, "table").solve(asked, prefer=prefer)
+    shipped_grasp = ik.load_grasp(grasp)
+    solution = solver_of(shipped_grasp.robot, "table").solve(shipped_grasp, prefer=prefer)
     assert solution.success, solution.collision
     assert solution.clearance is not None
     assert solution.clearance >= 0

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from robot_variants import derived_robot
-from toy_robots import grasp_of, moved, write_coupled_robot
+from toy_robots import grasp_of, moved_targets, write_coupled_robot
 from toy_robots import replace as put
 
 import casadi_ik as ik
@@ -33,7 +33,9 @@ pytestmark = pytest.mark.usefixtures("usual_flags")
 ROBOTS = ["kuka_lwr_barrett", "kuka_lwr_barrett_coupled", "ar10", "baxter_ar10"]
 
 
-def asked(targets: tuple[Array, Array], position: float, angle: float, limits: bool) -> TargetBatch:
+def batch_of_targets(
+    targets: tuple[Array, Array], position: float, angle: float, limits: bool
+) -> TargetBatch:
     return TargetBatch(*targets, ik.Tolerance(position, angle), limits)
 
 
@@ -69,8 +71,8 @@ def test_no_proof_of_what_can_be_reached(
     angle = 10 * tolerance
     # Contacts of which only the tolerance makes that they can be reached, too.
     part = rng.choice([0.0, 0.9, 0.99]) if tolerance > 1e-9 else 0.0
-    targets = moved(any_robot.contacts(q), rng, part * tolerance, part * angle)
-    problems = asked(targets, tolerance, angle, limits)
+    targets = moved_targets(any_robot.contacts(q), rng, part * tolerance, part * angle)
+    problems = batch_of_targets(targets, tolerance, angle, limits)
     assert wrongly(any_robot, Prover(any_robot.description), q, problems) == 0
 
 
@@ -85,20 +87,24 @@ def test_no_proof_within_tolerance(
 ) -> None:
     q = robot.lower + np.array(place) * (robot.upper - robot.lower)
     rng = np.random.default_rng(seed)
-    targets = moved(robot.contacts(q[None]), rng, part * 5e-3, part * np.deg2rad(3))
-    assert wrongly(robot, prover, q[None], asked(targets, 5e-3, np.deg2rad(3), True)) == 0
+    targets = moved_targets(robot.contacts(q[None]), rng, part * 5e-3, part * np.deg2rad(3))
+    assert (
+        wrongly(robot, prover, q[None], batch_of_targets(targets, 5e-3, np.deg2rad(3), True)) == 0
+    )
 
 
 def test_a_wrong_hand_is_lost(robot: ik.ArmHand, prover: Prover) -> None:
     """What is looked for is found: boxes that hold another hand are refuted."""
     q = robot.random(np.random.default_rng(8), 40)
-    problems = asked(robot.contacts(q), 5e-3, np.deg2rad(3), True)
+    problems = batch_of_targets(robot.contacts(q), 5e-3, np.deg2rad(3), True)
     assert wrongly(robot, prover, q[::-1], problems) >= 38
 
 
 def test_the_whole_search_finds_no_proof_either(robot: ik.ArmHand, prover: Prover) -> None:
     q = robot.random(np.random.default_rng(9), 4)
-    assert prover.prove(asked(robot.contacts(q), 5e-3, np.deg2rad(3), True)) == [None] * 4
+    assert (
+        prover.prove(batch_of_targets(robot.contacts(q), 5e-3, np.deg2rad(3), True)) == [None] * 4
+    )
 
 
 def test_ignored_limits_and_tiny_tolerances_are_never_unreachable(robot: ik.ArmHand) -> None:
@@ -123,7 +129,7 @@ def polynomial_robot(folder: Path) -> ik.ArmHand:
 
 
 @pytest.mark.parametrize(
-    "made",
+    "make_robot",
     [
         lambda folder: ik.load_robot(write_coupled_robot(folder)),
         lambda folder: derived_robot(folder, wrist_offset=0.045),
@@ -131,18 +137,18 @@ def polynomial_robot(folder: Path) -> ik.ArmHand:
     ],
     ids=["coupled", "bent", "cam"],
 )
-def test_coupled_mechanisms_and_other_arms(tmp_path: Path, made) -> None:
+def test_coupled_mechanisms_and_other_arms(tmp_path: Path, make_robot) -> None:
     """Chains of couplings, a prismatic thumb, an arm without a closed form."""
-    robot = made(tmp_path)
+    robot = make_robot(tmp_path)
     rng, prover = np.random.default_rng(5), Prover(robot.description)
     q = robot.random(rng, 200)
     q = q[robot.beyond_limits(q) <= 0][:16]
     targets = robot.contacts(q)
     for limits in (True, False):
-        assert wrongly(robot, prover, q, asked(targets, 1e-9, 1e-9, limits)) == 0
+        assert wrongly(robot, prover, q, batch_of_targets(targets, 1e-9, 1e-9, limits)) == 0
     centre = targets[0].mean(axis=1, keepdims=True)
     for points in (targets[0] + 5.0, centre + 9 * (targets[0] - centre)):
-        proofs = prover.prove(asked((points, targets[1]), 5e-3, 0.05, True))
+        proofs = prover.prove(batch_of_targets((points, targets[1]), 5e-3, 0.05, True))
         assert all(proof is not None for proof in proofs)
         assert all(proof.check(robot) for proof in proofs[:4])
 
@@ -158,16 +164,16 @@ def test_bounds_of_polynomials_hold(coefficients: list[float], ends: list[float]
     value = COUPLING_ROWS[Polynomial].bounds(
         coupling := Polynomial("a", tuple(coefficients)), *map(np.atleast_1d, (low, high))
     )
-    found = COUPLING_ROWS[Polynomial].interval(coupling, Interval(ca.SX(low), ca.SX(high)))
-    graph = [float(ca.evalf(end)) for end in (found.lower, found.upper)]
-    reached = coupling.followed(np.linspace(low, high, 101))
-    for least, most in (graph, (value[0][0], value[1][0])):
-        assert least <= reached.min()
-        assert reached.max() <= most
+    interval = COUPLING_ROWS[Polynomial].interval(coupling, Interval(ca.SX(low), ca.SX(high)))
+    graph = [float(ca.evalf(end)) for end in (interval.lower, interval.upper)]
+    values = coupling.followed(np.linspace(low, high, 101))
+    for lower_bound, upper_bound in (graph, (value[0][0], value[1][0])):
+        assert lower_bound <= values.min()
+        assert values.max() <= upper_bound
     # The width of a monomial over the interval bounds what is lost.
     size = sum(abs(c) * k * 4.0 ** (k - 1) for k, c in enumerate(coefficients))
-    for least, most in (graph, (value[0][0], value[1][0])):
-        assert most - least <= 4 * size * (high - low) + 1e-9 * (10 + size)
+    for lower_bound, upper_bound in (graph, (value[0][0], value[1][0])):
+        assert upper_bound - lower_bound <= 4 * size * (high - low) + 1e-9 * (10 + size)
 
 
 def impossible(robot: ik.ArmHand) -> dict[str, tuple[Array, Array]]:
@@ -183,7 +189,7 @@ def impossible(robot: ik.ArmHand) -> dict[str, tuple[Array, Array]]:
 def test_proofs_can_be_checked(robot: ik.ArmHand, prover: Prover) -> None:
     kinds = set()
     for targets in impossible(robot).values():
-        problems = asked(targets, 5e-3, np.deg2rad(3), True)
+        problems = batch_of_targets(targets, 5e-3, np.deg2rad(3), True)
         proofs = [proof for proof in prover.prove(problems) if proof is not None]
         assert len(proofs) >= 11
         for proof in proofs[:2]:
@@ -198,7 +204,7 @@ def test_a_finger_of_a_fixed_hand() -> None:
     points, normals = robot.contacts(robot.home)
     points[2] += [0, 0.05, 0.05]
     (proof,) = Prover(robot.description).prove(
-        asked((points[None], normals[None]), 5e-3, np.deg2rad(3), True)
+        batch_of_targets((points[None], normals[None]), 5e-3, np.deg2rad(3), True)
     )
     assert proof is not None
     assert (proof.kind, proof.fingers) == (ProofKind.FINGER, (robot.fingers[2],))
@@ -208,21 +214,21 @@ def test_a_finger_of_a_fixed_hand() -> None:
 def test_a_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
     """Even one that was sealed anew after what was changed in it."""
     targets = impossible(robot)
-    apart, shoulder = (
-        prover.prove(asked(targets[name], 5e-3, np.deg2rad(3), True))[0]
+    separation, shoulder = (
+        prover.prove(batch_of_targets(targets[name], 5e-3, np.deg2rad(3), True))[0]
         for name in ("apart", "shoulder")
     )
-    assert isinstance(apart, Proof)
+    assert isinstance(separation, Proof)
     assert isinstance(shoulder, Proof)
     loose = tuple(ik.Tolerance(1.0, 3.0) for _ in robot.fingers)
     tight = tuple(ik.Tolerance(1e-4, 1e-4) for _ in robot.fingers)
-    reachable = asked(robot.contacts(robot.home[None]), 5e-3, np.deg2rad(3), True)
-    assert not replace(apart, tolerance=loose).sealed().check(robot)
-    assert not replace(apart, tolerance=tight).sealed().check(robot)
-    assert not replace(apart, fingers=()).sealed().check(robot)
-    assert not replace(apart, fingers=("nobody",)).sealed().check(robot)
-    assert not replace(apart, target=reachable).sealed().check(robot)
-    assert not apart.check(robot, reachable)
+    reachable = batch_of_targets(robot.contacts(robot.home[None]), 5e-3, np.deg2rad(3), True)
+    assert not replace(separation, tolerance=loose).sealed().check(robot)
+    assert not replace(separation, tolerance=tight).sealed().check(robot)
+    assert not replace(separation, fingers=()).sealed().check(robot)
+    assert not replace(separation, fingers=("nobody",)).sealed().check(robot)
+    assert not replace(separation, target=reachable).sealed().check(robot)
+    assert not separation.check(robot, reachable)
     # Without the arm nothing is wrong with contacts in the shoulder.
     assert not replace(shoulder, kind=ProofKind.HAND).sealed().check(robot)
 
@@ -230,7 +236,7 @@ def test_a_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
 def test_every_number_of_a_proof_counts(robot: ik.ArmHand, prover: Prover) -> None:
     points, normals = robot.contacts(robot.random(np.random.default_rng(10), 20))
     normals[:, 0] *= -1
-    proofs = prover.prove(asked((points, normals), 5e-3, np.deg2rad(3), True))
+    proofs = prover.prove(batch_of_targets((points, normals), 5e-3, np.deg2rad(3), True))
     proof = next(proof for proof in proofs if proof is not None and proof.boxes > 1)
     assert proof.check(robot)
     assert not replace(proof, boxes=proof.boxes + 2).check(robot)
@@ -243,7 +249,7 @@ def test_the_shoulder_as_the_palm_sees_it(robot: ik.ArmHand, prover: Prover) -> 
     normals = np.array([[-0.849, -0.424, 0.316], [0.462, -0.108, 0.88], [0.013, 0.06, -0.998]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     target = np.array([points]), normals[None]
-    (proof,) = prover.prove(asked(target, 5e-3, np.deg2rad(3), True))
+    (proof,) = prover.prove(batch_of_targets(target, 5e-3, np.deg2rad(3), True))
     assert proof is not None
     assert proof.kind is ProofKind.REACH
     assert proof.boxes < 2000
@@ -257,17 +263,17 @@ def test_bounds_of_a_box_hold_for_what_is_in_it(robot: ik.ArmHand, prover: Prove
     for _ in range(300):
         q = robot.random(rng, 1)
         tolerance = 10.0 ** rng.uniform(-6, -2), 10.0 ** rng.uniform(-5, -1)
-        points, normals = moved(robot.contacts(q), rng, *tolerance)
-        problems = asked((points, normals), *tolerance, True)
+        points, normals = moved_targets(robot.contacts(q), rng, *tolerance)
+        problems = batch_of_targets((points, normals), *tolerance, True)
         places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
-        (inside,) = prover.space.from_positions(places, problems)
+        (positions,) = prover.space.from_positions(places, problems)
         lower, upper = prover.space.box(problems)
-        half = (upper - lower) * 10.0 ** rng.uniform(-3, -0.5)
-        middle = inside + rng.uniform(-1, 1, len(inside)) * half
-        given = np.tile(tolerance, (3, 1)), np.ones((3, 2))
-        low, high = np.maximum(middle - half, lower), np.minimum(middle + half, upper)
+        half_width = (upper - lower) * 10.0 ** rng.uniform(-3, -0.5)
+        middle = positions + rng.uniform(-1, 1, len(positions)) * half_width
+        tolerances = np.tile(tolerance, (3, 1)), np.ones((3, 2))
+        low, high = np.maximum(middle - half_width, lower), np.minimum(middle + half_width, upper)
         values, widths, ends = (
-            np.array(part).ravel() for part in bounds(low, high, points[0], normals[0], *given)
+            np.array(part).ravel() for part in bounds(low, high, points[0], normals[0], *tolerances)
         )
         assert (np.abs(values) <= widths).all()
         closest = max(closest, float((np.abs(values) / widths).max()))
@@ -286,10 +292,12 @@ def _bounds(prover: Prover) -> ca.Function:
     ranges = prover.space.intervals(p["lower"], p["upper"])
     contacts = box_contacts(prover.space, ranges, (p["upper"] - p["lower"]) / 2, p, True)
     rows = [row for a, b in combinations(contacts, 2) for row in pair_rows(a, b)]
-    seen = PointInPalm.from_point(contacts, ca.SX(ca.DM(prover._arm.shoulder)))
-    least, most, _ = seen.distances(ca.SX(ca.DM(prover._arm.wrist)))
+    point_in_palm = PointInPalm.from_point(contacts, ca.SX(ca.DM(prover._arm.shoulder)))
+    min_distance, max_distance, _ = point_in_palm.distances(ca.SX(ca.DM(prover._arm.wrist)))
     outputs = [ca.vertcat(*(getattr(row, name) for row in rows)) for name in ("value", "width")]
-    return ca.Function("bounds", list(p.values()), [*outputs, ca.vertcat(least, most)])
+    return ca.Function(
+        "bounds", list(p.values()), [*outputs, ca.vertcat(min_distance, max_distance)]
+    )
 
 
 @pytest.mark.slow
@@ -300,7 +308,7 @@ def test_limits_of_shoulder_and_wrist_are_part_of_the_reach(
     rng = np.random.default_rng(12)
     q, wrist = robot.random(rng, 8), robot.actuators.index("lwr_joint_6")
     q[:, wrist] = robot.upper[wrist] + 0.8
-    problems = asked(robot.contacts(q), 1e-3, np.deg2rad(0.5), True)
+    problems = batch_of_targets(robot.contacts(q), 1e-3, np.deg2rad(0.5), True)
     proofs = [proof for proof in prover.prove(problems) if proof is not None]
     assert proofs
     assert {proof.kind for proof in proofs} == {ProofKind.REACH}
@@ -345,7 +353,7 @@ def test_what_is_missed_by_little_gets_few_boxes(
     monkeypatch.setattr(solver._engine.diagnostician._prover, "prove", noted)
     rng = np.random.default_rng(2)
     points, normals = robot.contacts(robot.random(rng, 10))
-    solver.solve_batch(*moved((points, normals), rng, 1e-2, 0.11), diagnose=True)
+    solver.solve_batch(*moved_targets((points, normals), rng, 1e-2, 0.11), diagnose=True)
     points[0, 0] += 0.2
     solver.solve_batch(points[:1], normals[:1], diagnose=True)
     assert boxes[-1] == PROVER_EFFORT.max_boxes

@@ -43,15 +43,15 @@ def test_short(name):
 
 
 def test_what_is_said(robot):
-    _, solved, missed, batch, why, ranked, best = answers("kuka_lwr_barrett")
+    _, solved, missed, batch, diagnosis, ranked, best = answers("kuka_lwr_barrett")
     assert "SOLVED  hand-first on kuka_lwr_barrett" in str(solved)
     for name, value in zip(solved.actuators, solved.q, strict=True):
         assert f"{name}" in str(solved)
         assert f"{value:.6f}" in str(solved)
     assert all(finger in str(solved) for finger in robot.fingers)
     assert missed.status.name in str(missed)
-    assert why.lines[0][:40] in str(missed)
-    assert str(why).split("\n")[0] == why.lines[0][:80]
+    assert diagnosis.lines[0][:40] in str(missed)
+    assert str(diagnosis).split("\n")[0] == diagnosis.lines[0][:80]
     assert f"{batch.success.sum()} of 300 targets" in str(batch)
     assert "rows 7" in str(batch)
     assert "3 of 3 " in str(ranked)
@@ -99,10 +99,10 @@ def test_progress_is_shown_on_a_terminal_and_changes_no_answer(jobs):
     piped = subprocess.run(words, capture_output=True, text=True, check=True)
     assert piped.stderr == ""
     ours, theirs = os.openpty()
-    shown = subprocess.run(
+    process = subprocess.run(
         words, stdout=subprocess.PIPE, stderr=theirs, text=True, check=True, env=TERMINAL
     )
     os.close(theirs)
     assert b"/400" in os.read(ours, 100_000)
     os.close(ours)
-    assert shown.stdout == piped.stdout
+    assert process.stdout == piped.stdout

@@ -33,8 +33,8 @@ def same_as_the_log(solver: ik.Solver, grasp: ik.Grasp, path: Path) -> ik.Soluti
     for record, row in zip(records, rows, strict=True):
         assert set(record) <= set(row.dtype.names)
         # What else is in a log is measured of finished traces.
-        more = set(row.dtype.names) - set(record)
-        assert all(name.startswith(("sigma_", "condition_")) for name in more)
+        extra_fields = set(row.dtype.names) - set(record)
+        assert all(name.startswith(("sigma_", "condition_")) for name in extra_fields)
         np.testing.assert_array_equal(record["q"], row["q"])
         for name in ("phase", "status"):
             assert record[name] == row[name]
@@ -53,8 +53,8 @@ def test_steps_go_through_all_rounds(robot, method: str, tmp_path) -> None:
     """A target out of reach takes every start there is; by hand as well as in the loop."""
     solver = ik.Solver(robot, method)
     points, normals = ik.load_grasp("sugar_box").arrays(robot.fingers)
-    away = grasp_of(robot, points + np.array([0.0, 0.0, 3.0]), normals)
-    solution = same_as_the_log(solver, away, tmp_path / "x.mcap")
+    far_grasp = grasp_of(robot, points + np.array([0.0, 0.0, 3.0]), normals)
+    solution = same_as_the_log(solver, far_grasp, tmp_path / "x.mcap")
     assert solution.status is ik.Status.STALLED
     # Six rounds of eight hands from tables and five from anywhere.
     expected = 8 * (6 + 5) if method == "hand-first" else 32
@@ -86,6 +86,6 @@ def test_bad_input_is_refused(stepped_solver: ik.Solver) -> None:
 
 
 def test_a_method_that_cannot_be_stepped_says_why(stepped_solver: ik.Solver) -> None:
-    other = ik.Solver(stepped_solver.robot, method="ipopt")
+    ipopt_solver = ik.Solver(stepped_solver.robot, method="ipopt")
     with pytest.raises(errors.UnsupportedError, match="Ipopt"):
-        other.stepper(ik.load_grasp("sugar_box"))
+        ipopt_solver.stepper(ik.load_grasp("sugar_box"))

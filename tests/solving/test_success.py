@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from toy_robots import grasps_of, moved
+from toy_robots import grasps_of, moved_targets
 
 import casadi_ik as ik
 
@@ -25,7 +25,7 @@ def displaced_targets(robot: ik.ArmHand, tolerance: ik.Tolerance) -> tuple:
     """Return contacts (k, f, 3) of random configurations, displaced within the tolerance."""
     rng = np.random.default_rng(7)
     targets = robot.contacts(robot.random(rng, COUNT))
-    return moved(targets, rng, SHARE * tolerance.position, SHARE * tolerance.angle)
+    return moved_targets(targets, rng, SHARE * tolerance.position, SHARE * tolerance.angle)
 
 
 def unsolved(robot: ik.ArmHand, tolerance: ik.Tolerance) -> dict[str, list[int]]:
@@ -63,11 +63,13 @@ def unsolved(robot: ik.ArmHand, tolerance: ik.Tolerance) -> dict[str, list[int]]
         for name in ("q0", "limits", "manipulability")
         if name != "manipulability" or robot.description.arm_actuators
     }
-    return {call: np.flatnonzero(~np.asarray(found)).tolist() for call, found in success.items()}
+    return {
+        call: np.flatnonzero(~np.asarray(is_solved)).tolist() for call, is_solved in success.items()
+    }
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES, ids=["3 deg", "30 deg"])
 def test_success_depends_on_the_question_alone(robot, tolerance):
     """The configuration that a target was made from solves it."""
-    lost = {call: rows for call, rows in unsolved(robot, tolerance).items() if rows}
-    assert not lost
+    failures = {call: rows for call, rows in unsolved(robot, tolerance).items() if rows}
+    assert not failures

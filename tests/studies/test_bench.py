@@ -32,14 +32,14 @@ CASES = (
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case[0])
 def test_every_part_is_measured(case):
     assert case[0] in bench_parts.CASES
-    found = bench_parts.MEASUREMENTS[case[0]](*case[1:])()
-    assert all(value >= 0 for value in found.values())
-    assert found.get("missed", 0) == 0
+    measured = bench_parts.MEASUREMENTS[case[0]](*case[1:])()
+    assert all(value >= 0 for value in measured.values())
+    assert measured.get("missed", 0) == 0
 
 
 def test_two_checkouts_by_turns(tmp_path):
-    asked = ["--part", "batch", "--robots", "ar10", "--count", "16", "--turns", "2"]
-    bench.main([*asked, "--against", str(ROOT), "--report", str(tmp_path)])
+    arguments = ["--part", "batch", "--robots", "ar10", "--count", "16", "--turns", "2"]
+    bench.main([*arguments, "--against", str(ROOT), "--report", str(tmp_path)])
     text = (tmp_path / "report.md").read_text()
     rows = re.findall(r"^\| batch \| ar10 \| \w+ \S+ 16 \| us \| (.*) \|$", text, re.MULTILINE)
     assert len(rows) == 4
@@ -62,12 +62,12 @@ def test_peers_see_the_robot_that_we_solve(name):
     robot = ik.load_robot(name)
     contacts = peers.PinContacts(robot)
     q = robot.random(np.random.default_rng(0), 5)
-    for one, points, normals in zip(q, *robot.contacts(q), strict=True):
-        found, rotations = contacts.at(contacts.model.createData(), one)
-        np.testing.assert_allclose(found, points, atol=1e-12)
-        turned = np.einsum("fij,fj->fi", rotations, contacts.axes)
-        np.testing.assert_allclose(turned, normals, atol=1e-12)
-        theta = contacts.theta(one)
+    for q_row, points, normals in zip(q, *robot.contacts(q), strict=True):
+        points_of_peer, rotations = contacts.at(contacts.model.createData(), q_row)
+        np.testing.assert_allclose(points_of_peer, points, atol=1e-12)
+        peer_normals = np.einsum("fij,fj->fi", rotations, contacts.axes)
+        np.testing.assert_allclose(peer_normals, normals, atol=1e-12)
+        theta = contacts.theta(q_row)
         assert (theta >= contacts.model.lowerPositionLimit).all()
         assert (theta <= contacts.model.upperPositionLimit).all()
 

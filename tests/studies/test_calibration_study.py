@@ -17,6 +17,6 @@ def coverages(report: str) -> list[float]:
 def test_the_committed_report_is_of_many_hands_and_its_bars_are_true():
     committed = (STUDIES / "results" / "calibration" / "report.md").read_text()
     assert "--hands 150" in committed
-    held = coverages(committed)
-    assert len(held) == 9
-    assert all(93 < percent < 97 for percent in held)
+    coverage = coverages(committed)
+    assert len(coverage) == 9
+    assert all(93 < percent < 97 for percent in coverage)

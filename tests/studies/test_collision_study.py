@@ -15,11 +15,11 @@ def test_a_check_is_never_free_where_others_see_a_penetration():
     assert [row[0] for row in rows] == ["random", "free"]
     assert "1 um: **0**" in sentence
     part = collision.Part("coal", search.Piece(collision.ROBOT, 0, 0, 0, 0), 60)
-    found = collision.solve(part)
-    assert found["checked"] == 60
-    assert 0 < found["free"] < 60
-    assert found["others"] == 1
-    assert found["falsely_free"] == 0
+    result = collision.solve(part)
+    assert result["checked"] == 60
+    assert 0 < result["free"] < 60
+    assert result["others"] == 1
+    assert result["falsely_free"] == 0
 
 
 def test_the_choice_is_measured_and_resumed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):

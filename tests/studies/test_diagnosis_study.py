@@ -14,13 +14,13 @@ STUDIES = Path(__file__).parents[2] / "studies"
 
 
 def test_the_study_agrees_with_itself_and_the_committed_report_has_no_false_alarm(tmp_path):
-    kept = tmp_path / "kept.npz"
+    stored_part = tmp_path / "kept.npz"
     small = [STUDIES / "diagnosis.py", "--impossible", "3"]
-    for more in (
-        ["--count", "0", "--keep", kept, "--report", tmp_path],
-        ["--count", "20", "--bad-starts", "20", "--against", kept, "--report", tmp_path],
+    for options in (
+        ["--count", "0", "--keep", stored_part, "--report", tmp_path],
+        ["--count", "20", "--bad-starts", "20", "--against", stored_part, "--report", tmp_path],
     ):
-        run = python(*small, *more)
+        run = python(*small, *options)
         assert run.returncode == 0, run.stderr
     report = (tmp_path / "report.md").read_text()
     table = report.partition("## Against")[2]
@@ -33,4 +33,4 @@ def test_the_study_agrees_with_itself_and_the_committed_report_has_no_false_alar
     alarms = re.findall(r"\| ([\d,]+) \| [\d,]+ \| \d+ \| (\d+) \| (\d+) \|$", committed, re.M)
     counts = [int(count.replace(",", "")) for count, _, _ in alarms]
     assert sum(counts) >= 11_200
-    assert all(called == "0" for _, _, called in alarms)
+    assert all(false_alarms == "0" for _, _, false_alarms in alarms)

@@ -15,32 +15,32 @@ from casadi_ik import logs
 
 
 @pytest.fixture(scope="module")
-def kept() -> StoredBlocks:
+def stored_blocks() -> StoredBlocks:
     robot = ik.load_robot("kuka_lwr_barrett")
     options = {"max_iterations": 300}
     solver = ik.Solver(robot, "enhanced-dls", finger_step="closed-form", options=options)
-    found = StoredBlocks()
-    solver.solve_batch(*event_thresholds.targets_of(robot, 24, 0), log=found)
-    return found
+    blocks = StoredBlocks()
+    solver.solve_batch(*event_thresholds.targets_of(robot, 24, 0), log=blocks)
+    return blocks
 
 
-def test_what_a_threshold_catches(kept: StoredBlocks) -> None:
+def test_what_a_threshold_catches(stored_blocks: StoredBlocks) -> None:
     """The share of solves whose smallest singular value is below it, by the traces themselves."""
-    rows = np.concatenate([block.rows for block in kept.blocks])
-    counts = np.concatenate([block.batch.iterations for block in kept.blocks])
-    solved = np.concatenate([block.batch.success for block in kept.blocks])
+    rows = np.concatenate([block.rows for block in stored_blocks.blocks])
+    counts = np.concatenate([block.batch.iterations for block in stored_blocks.blocks])
+    solved = np.concatenate([block.batch.success for block in stored_blocks.blocks])
     assert 0 < solved.sum() < len(solved)
     starts = np.cumsum(counts) - counts
     shares = []
-    for trial in event_thresholds.trials(kept.blocks[0]):
+    for trial in event_thresholds.trials(stored_blocks.blocks[0]):
         if (trial.kind, trial.subject) != (logs.EventKind.NEAR_SINGULAR, "closed_chain"):
             continue
         lowest = np.fmin.reduceat(rows["sigma_closed_chain"], starts)
-        found = event_thresholds.caught(kept.blocks, trial)
+        caught = event_thresholds.caught(stored_blocks.blocks, trial)
         below = lowest < np.float32(trial.threshold)
-        assert found.failed == pytest.approx(100 * below[~solved].mean())
-        assert found.solved == pytest.approx(100 * below[solved].mean())
-        shares.append(found.failed)
+        assert caught.failed == pytest.approx(100 * below[~solved].mean())
+        assert caught.solved == pytest.approx(100 * below[solved].mean())
+        shares.append(caught.failed)
     assert len(shares) == len(event_thresholds.FACTORS)
     assert shares == sorted(shares)
     assert shares[0] < shares[-1]

@@ -11,7 +11,7 @@ from samplers import SAMPLERS, displaced, finger_sets, palm_slopes, singular_arm
 
 import casadi_ik as ik
 
-ONE = ["--robots", "kuka_lwr_barrett", "--tolerance", "default"]
+ONE_CASE = ["--robots", "kuka_lwr_barrett", "--tolerance", "default"]
 
 
 @pytest.mark.parametrize("name", [*misses.ROBOTS[-2:], "kuka_lwr_barrett"])
@@ -30,13 +30,13 @@ def test_singular_arms_are_nearer_to_singular(robot, rng):
 
 
 def test_a_count_goes_on_and_lists_what_is_lost(tmp_path):
-    asked = [*ONE, "--sampler", "random", "--block", "40", "--out", str(tmp_path)]
-    misses.main([*asked, "--count", "40"])
+    arguments = [*ONE_CASE, "--sampler", "random", "--block", "40", "--out", str(tmp_path)]
+    misses.main([*arguments, "--count", "40"])
     (first,) = (tmp_path / "kuka_lwr_barrett").rglob("*.json")
-    kept = json.loads(first.read_text())
-    kept["found"]["missed"] = [{"row": 3, "status": "STALLED", "q": [0.25] * 14}]
-    first.write_text(json.dumps(kept))
-    misses.main([*asked, "--count", "80"])
+    stored = json.loads(first.read_text())
+    stored["found"]["missed"] = [{"row": 3, "status": "STALLED", "q": [0.25] * 14}]
+    first.write_text(json.dumps(stored))
+    misses.main([*arguments, "--count", "80"])
     assert len(list((tmp_path / "kuka_lwr_barrett").rglob("*.json"))) == 2
     text = (tmp_path / "report" / "report.md").read_text()
     assert "80 solves, 1 missed." in text
@@ -48,8 +48,8 @@ def test_a_count_goes_on_and_lists_what_is_lost(tmp_path):
 def test_a_search_goes_on_and_climbs(tmp_path):
     states = []
     for minutes in ("0.02", "0.04"):
-        asked = [*ONE, "--sampler", "climb", "--minutes", minutes, "--out", str(tmp_path)]
-        misses.main(asked)
+        arguments = [*ONE_CASE, "--sampler", "climb", "--minutes", minutes, "--out", str(tmp_path)]
+        misses.main(arguments)
         (path,) = (tmp_path / "climb").glob("*.state.json")
         states.append(json.loads(path.read_text())["search"])
     first, then = states

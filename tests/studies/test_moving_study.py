@@ -16,13 +16,13 @@ def test_a_path_that_is_stored_is_not_computed_again(tmp_path, monkeypatch: pyte
     words += ["--report", str(report)]
     moving.main(["--count", "1", *words])
     (first,) = (folder / "kuka_lwr_barrett").glob("path_*.json")
-    kept = json.loads(first.read_text())
+    stored = json.loads(first.read_text())
     for path in ("smooth", "leaping"):
-        assert kept["found"][f"{path}_velocity"] <= 1 + 1e-6
-        assert kept["found"][f"{path}_acceleration"] <= 1 + 1e-6
-    assert kept["found"]["met"] == 1
-    kept["found"] |= {"met": 0.5, "median": 77.0}
-    first.write_text(json.dumps(kept))
+        assert stored["found"][f"{path}_velocity"] <= 1 + 1e-6
+        assert stored["found"][f"{path}_acceleration"] <= 1 + 1e-6
+    assert stored["found"]["met"] == 1
+    stored["found"] |= {"met": 0.5, "median": 77.0}
+    first.write_text(json.dumps(stored))
     moving.main(["--count", "2", *words])
     assert json.loads(first.read_text())["found"]["median"] == 77
     text = (report / "report.md").read_text()

@@ -20,8 +20,8 @@ def test_a_random_search_finds_what_is_there_and_nothing_else():
 def test_targets_about_one_keep_its_tolerances():
     robot, tolerance = ik.load_robot("g1+dex3"), ik.Tolerance()
     points, normals = robot.contacts(robot.home)
-    moved, turned = one_body.around(points, normals, 500, np.random.default_rng(0))
-    off = np.linalg.norm(moved - points, axis=2)
-    angle = np.arccos(np.clip((turned * normals).sum(axis=2), -1, 1))
-    for each, most in ((off, tolerance.position), (angle, tolerance.angle)):
-        assert 0.99 * most < each.max() <= most * (1 + 1e-9)
+    moved_points, turned_normals = one_body.around(points, normals, 500, np.random.default_rng(0))
+    off = np.linalg.norm(moved_points - points, axis=2)
+    angle = np.arccos(np.clip((turned_normals * normals).sum(axis=2), -1, 1))
+    for errors, tolerance_value in ((off, tolerance.position), (angle, tolerance.angle)):
+        assert 0.99 * tolerance_value < errors.max() <= tolerance_value * (1 + 1e-9)

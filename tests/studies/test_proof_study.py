@@ -12,18 +12,18 @@ import proofs
 def test_counts_go_on_and_false_proofs_are_listed(tmp_path, monkeypatch):
     monkeypatch.setattr(proofs, "BLOCK", 6)
     out, report = tmp_path / "out", tmp_path / "report"
-    asked = ["--robot", "ar10", "--out", str(out), "--report", str(report), "--impossible", "4"]
-    proofs.main([*asked, "--count", "6"])
+    arguments = ["--robot", "ar10", "--out", str(out), "--report", str(report), "--impossible", "4"]
+    proofs.main([*arguments, "--count", "6"])
     cases = [case for case in proofs.CASES if case[0] != "blind hands"]
     files = sorted((out / "ar10").glob("*.json"))
     assert len(files) == len(cases) + len(impossible_targets.CLASSES) - 2
     text = (report / "report.md").read_text()
     assert f"{6 * len(cases)} targets, 0 false proofs." in text
     path = next(path for path in files if path.name.startswith("corners"))
-    kept = json.loads(path.read_text())
-    kept["found"]["false"] = [[0.125] * 10]
-    path.write_text(json.dumps(kept))
-    proofs.main([*asked, "--count", "12"])
+    stored = json.loads(path.read_text())
+    stored["found"]["false"] = [[0.125] * 10]
+    path.write_text(json.dumps(stored))
+    proofs.main([*arguments, "--count", "12"])
     assert len(list((out / "ar10").glob("*.json"))) == len(files) + len(cases)
     text = (report / "report.md").read_text()
     assert f"{12 * len(cases)} targets, 1 false proofs." in text
@@ -31,11 +31,11 @@ def test_counts_go_on_and_false_proofs_are_listed(tmp_path, monkeypatch):
 
 
 def test_every_class_makes_other_contacts(robot):
-    made = []
+    contact_sets = []
     for name in impossible_targets.CLASSES:
         points, normals = impossible_targets.impossible(robot, name, np.random.default_rng(1), 5)
         assert points.shape == normals.shape == (5, 3, 3)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=2), 1, atol=1e-12)
-        made.append(np.concatenate([points, normals]))
+        contact_sets.append(np.concatenate([points, normals]))
     plain = robot.contacts(robot.random(np.random.default_rng(1), 5))
-    assert all(not np.allclose(item, np.concatenate(plain)) for item in made)
+    assert all(not np.allclose(item, np.concatenate(plain)) for item in contact_sets)

@@ -45,21 +45,23 @@ def test_table_one(tmp_path, monkeypatch):
     common = ["--out", str(out), "--report", str(report), "--block", "2"]
     table_one.main(["--count", "2", "--methods", "hand-first", "enhanced-dls", *common])
     text = (report / "report.md").read_text()
-    found = metrics(report)
-    assert found["table-one/hand-first/enforce/success"]["value"] == 100
-    enhanced = found["table-one/enhanced-dls/ignore/success"]
+    values = metrics(report)
+    assert values["table-one/hand-first/enforce/success"]["value"] == 100
+    enhanced = values["table-one/enhanced-dls/ignore/success"]
     assert enhanced["n"] == 24
     assert enhanced["low"] < enhanced["value"] <= enhanced["high"] <= 100
-    assert found["table-one/original-dls/ignore/success"]["n"] == 0
+    assert values["table-one/original-dls/ignore/success"]["n"] == 0
     assert "| `enhanced-dls` | 95.9 | 181 | 343 |" in text
     assert text.count("*Not run yet.*") == 2
     for name in ("success", "iterations", "convergence"):
         assert f"({name}.png)" in text
         assert (report / f"{name}.png").stat().st_size > 10_000
     table_one.main(["--count", "0", *common])
-    again = (report / "report.md").read_text()
-    assert again.partition("Made by")[0] == text.partition("Made by")[0], "only the command differs"
-    assert "--count 0" in again.partition("Made by")[2]
+    report_again = (report / "report.md").read_text()
+    assert report_again.partition("Made by")[0] == text.partition("Made by")[0], (
+        "only the command differs"
+    )
+    assert "--count 0" in report_again.partition("Made by")[2]
 
 
 def test_every_choice_can_be_built(tmp_path):
@@ -68,37 +70,37 @@ def test_every_choice_can_be_built(tmp_path):
     for study in studies:
         keys = [setting.key for setting in study.settings]
         assert len(set(keys)) == len(keys)
-        made = [
+        solvers = [
             (study.solver(setting).parameters, study.start(setting).tolist(), setting.robot)
             for setting in study.settings
         ]
-        for i, one in enumerate(made):
-            assert one not in made[:i], keys[i]
+        for i, solver in enumerate(solvers):
+            assert solver not in solvers[:i], keys[i]
 
 
 def test_the_mounting_face_is_another_palm_frame(robot, tmp_path):
     study = ablation_study(tmp_path, 1, 0, 1)
     setting = next(item for item in study.settings if "mounting face" in item.key)
-    moved = study.solver(setting).robot
-    offset = np.linalg.inv(moved.palm(robot.home)) @ robot.palm(robot.home)
+    robot_moved = study.solver(setting).robot
+    offset = np.linalg.inv(robot_moved.palm(robot.home)) @ robot.palm(robot.home)
     np.testing.assert_allclose(offset[:3, 3], [0, 0, 0.08], atol=1e-12)
 
 
 def test_one_ablation_changes_the_outcome(tmp_path):
     """Without the closed chain less is solved: on the same targets."""
     study = ablation_study(tmp_path / "robots", 4, 2021, 4)
-    wanted = ("enhanced-dls, as in the table", "enhanced-dls, no closed chain")
+    settings_compared = ("enhanced-dls, as in the table", "enhanced-dls, no closed chain")
     budget = {"max_iterations": 400}
     settings = tuple(
         dataclasses.replace(setting, options={**setting.options, **budget})
         for setting in study.settings
-        if setting.key in wanted
+        if setting.key in settings_compared
     )
     study = dataclasses.replace(study, settings=settings, sets=study.sets[:4])
     run(study, tmp_path / "results")
     table = read_results(study, tmp_path / "results")
     solved = dict(table.group_by("setting").agg(pl.col("success").sum()).rows())
-    assert solved[wanted[0]] > solved[wanted[1]]
+    assert solved[settings_compared[0]] > solved[settings_compared[1]]
 
 
 def test_distance_of_a_reading():

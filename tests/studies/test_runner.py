@@ -62,8 +62,8 @@ def test_targets_of_a_block_are_its_own(done):
     np.testing.assert_array_equal(q, STUDY.configurations(first, 0))
     assert not np.array_equal(q, STUDY.configurations(first, 1))
     assert not np.array_equal(q, STUDY.configurations(second, 0))
-    again = dataclasses.replace(STUDY, count=5 * STUDY.count)
-    np.testing.assert_array_equal(q, again.configurations(first, 0))
+    larger_study = dataclasses.replace(STUDY, count=5 * STUDY.count)
+    np.testing.assert_array_equal(q, larger_study.configurations(first, 0))
 
 
 def test_jobs_change_nothing(done, tmp_path):
@@ -99,9 +99,13 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
         def wait_for_workers(self, n_workers: int, timeout: float) -> None: ...
 
         def get_versions(self, packages):
-            here = get_versions(packages)
-            worker = {"packages": here["packages"] | {"casadi-ik": "0.0.1"}}
-            return {"client": here, "scheduler": here, "workers": {"tcp://worker:1": worker}}
+            versions = get_versions(packages)
+            worker = {"packages": versions["packages"] | {"casadi-ik": "0.0.1"}}
+            return {
+                "client": versions,
+                "scheduler": versions,
+                "workers": {"tcp://worker:1": worker},
+            }
 
     with pytest.raises(
         ik.errors.InputError, match=r"tcp://worker:1 has .*casadi-ik 0\.0\.1.*expected"
@@ -117,20 +121,20 @@ def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
     command = [sys.executable, str(Path(small_study.__file__)), str(tmp_path)]
     environment = os.environ | {"PYTHONPATH": FOLDERS}
     while not (tmp_path / STUDY_FILE).exists() or missing(STUDY, tmp_path):
-        before = {path: path.read_bytes() for path in tmp_path.rglob("*.parquet")}
+        data_before = {path: path.read_bytes() for path in tmp_path.rglob("*.parquet")}
         process = subprocess.Popen(
             command, env=environment, stderr=subprocess.DEVNULL, start_new_session=True
         )
         not_before = time.monotonic() + rng.uniform(0.0, 2.0)
         while kills < 4 and process.poll() is None:
             # Not before it has begun to work: a process that only imports shows nothing.
-            there = len(list(tmp_path.rglob("*.parquet")))
-            if time.monotonic() > not_before and there > len(before):
+            file_count = len(list(tmp_path.rglob("*.parquet")))
+            if time.monotonic() > not_before and file_count > len(data_before):
                 os.killpg(process.pid, signal.SIGKILL)
                 kills += 1
             time.sleep(0.002)
         process.wait()
-        for path, content in before.items():
+        for path, content in data_before.items():
             assert path.read_bytes() == content, "what is done is not done again"
             assert not ik.logs.open(path.with_suffix(".mcap")).info().unfinished
     assert kills > 0
@@ -209,11 +213,11 @@ def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
     ],
 )
 def test_different_settings_do_not_mix(done, change, says):
-    before = (done / STUDY_FILE).read_bytes()
+    data_before = (done / STUDY_FILE).read_bytes()
     with pytest.raises(ik.errors.InputError) as caught:
         run(dataclasses.replace(STUDY, **change), done)
     assert says in str(caught.value)
-    assert (done / STUDY_FILE).read_bytes() == before
+    assert (done / STUDY_FILE).read_bytes() == data_before
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path):

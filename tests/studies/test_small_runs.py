@@ -61,10 +61,12 @@ def test_a_small_run_writes_the_report_and_is_resumed(name: str, tmp_path: Path)
     pictures = re.findall(r"\(([a-z_]+\.png)\)", text)
     assert all((report.parent / picture).stat().st_size > 1000 for picture in pictures)
     metrics = report.with_name("metrics.json")
-    found = {entry["name"]: entry for entry in json.loads(metrics.read_text())} if expected else {}
+    entries = (
+        {entry["name"]: entry for entry in json.loads(metrics.read_text())} if expected else {}
+    )
     for metric, (value, count) in expected.items():
-        assert value is None or found[metric]["value"] == value
-        assert count is None or found[metric]["n"] == count
+        assert value is None or entries[metric]["value"] == value
+        assert count is None or entries[metric]["n"] == count
     parts = {path: path.stat().st_mtime_ns for path in tmp_path.glob("parts/**/*.json")}
     if parts:
         study.main(words.format(tmp_path).split())

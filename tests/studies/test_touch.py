@@ -29,6 +29,6 @@ def test_every_pose_rests_on_the_table():
 
 def test_contacts_that_do_not_oppose_each_other_do_not_close():
     assert touch.closes(ACROSS, -ACROSS / 0.03, 0.03)
-    aside = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    assert not touch.closes(ACROSS, aside, 0.03)
+    side_normals = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert not touch.closes(ACROSS, side_normals, 0.03)
     assert not touch.closes(ACROSS[:1], -ACROSS[:1] / 0.03, 0.03)

@@ -15,8 +15,8 @@ from runner.study import standing
 
 def test_every_claim_holds_on_a_coarse_mesh(tmp_path):
     robots = ["panda+allegro_right", "panda+leap"]
-    given = ["--robots", *robots, "--meshes", "coarse_can", "--limit", "25"]
-    touch_claims.main([*given, "--parts", str(tmp_path / "parts"), "--out", str(tmp_path)])
+    arguments = ["--robots", *robots, "--meshes", "coarse_can", "--limit", "25"]
+    touch_claims.main([*arguments, "--parts", str(tmp_path / "parts"), "--out", str(tmp_path)])
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert len(metrics) == len(robots) * len(touch_claims.CLAIMS)
     assert all(metric["n"] == 25 for metric in metrics)
@@ -34,9 +34,9 @@ def test_the_check_tells_another_mesh():
     larger.apply_scale(1.6)
     assert touch_claims.check(solver.robot, smaller, pose, grasp)["off"]
     assert touch_claims.check(solver.robot, larger, pose, grasp)["deep"]
-    turned = pose.copy()
-    turned[:3, :3] = turned[:3, :3] @ [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
-    violations = touch_claims.check(solver.robot, mesh, turned, grasp)
+    turned_pose = pose.copy()
+    turned_pose[:3, :3] = turned_pose[:3, :3] @ [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+    violations = touch_claims.check(solver.robot, mesh, turned_pose, grasp)
     assert violations["leaning"]
     assert violations["outside the cone"]
 
@@ -44,5 +44,5 @@ def test_the_check_tells_another_mesh():
 def test_closure_needs_contacts_that_oppose_each_other():
     across = np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]])
     assert touch_claims.closure_margin(across, -across / 0.03, 0.03) > 1e-3
-    aside = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    assert touch_claims.closure_margin(across, aside, 0.03) <= 1e-9
+    side_normals = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert touch_claims.closure_margin(across, side_normals, 0.03) <= 1e-9

@@ -20,28 +20,28 @@ RESULTS = Path(touch_hold.__file__).parent / "results"
 
 def test_what_is_squeezed_too_little_falls(monkeypatch):
     solver, surface = ik.Solver(ik.load_robot("panda+panda_hand")), ik.load_surface("tennis_ball")
-    (one,) = solver.grasps_of(surface, standing(surface, 0.7), limit=1, among=1)
+    (grasp,) = solver.grasps_of(surface, standing(surface, 0.7), limit=1, among=1)
     down = -np.eye(3)[2:]
-    hold = touch_hold.Hold(solver.robot, one, surface)
+    hold = touch_hold.Hold(solver.robot, grasp, surface)
     assert hold.is_held(hold.settled(), down).all()
     monkeypatch.setattr(touch_hold, "SQUEEZE", 0.02)
-    hold = touch_hold.Hold(solver.robot, one, surface)
+    hold = touch_hold.Hold(solver.robot, grasp, surface)
     assert not hold.is_held(hold.settled(), down).any()
 
 
 def test_the_area_under_the_curve():
-    held = np.array([True, False, True, False])
-    assert touch_hold.concordance(np.array([4.0, 1.0, 3.0, 2.0]), held) == 1.0
-    assert touch_hold.concordance(np.array([1.0, 4.0, 2.0, 3.0]), held) == 0.0
-    assert touch_hold.concordance(np.ones(4), held) == 0.5
+    is_held = np.array([True, False, True, False])
+    assert touch_hold.concordance(np.array([4.0, 1.0, 3.0, 2.0]), is_held) == 1.0
+    assert touch_hold.concordance(np.array([1.0, 4.0, 2.0, 3.0]), is_held) == 0.0
+    assert touch_hold.concordance(np.ones(4), is_held) == 0.5
 
 
-@pytest.mark.parametrize(("folder", "least"), [("touch_hold", 0.88), ("touch_hold_ycb", 0.88)])
-def test_in_the_committed_reports_the_load_predicts(folder, least):
+@pytest.mark.parametrize(("folder", "min_value"), [("touch_hold", 0.88), ("touch_hold_ycb", 0.88)])
+def test_in_the_committed_reports_the_load_predicts(folder, min_value):
     text = (RESULTS / folder / "metrics.json").read_text()
-    found = {one["name"]: one["value"] for one in json.loads(text)}
-    areas = [value for name, value in found.items() if name.endswith("/auc")]
+    values = {entry["name"]: entry["value"] for entry in json.loads(text)}
+    areas = [value for name, value in values.items() if name.endswith("/auc")]
     assert len(areas) >= 5
-    assert min(areas) >= least
-    best = [value for name, value in found.items() if name.endswith("/best_third")]
+    assert min(areas) >= min_value
+    best = [value for name, value in values.items() if name.endswith("/best_third")]
     assert min(best) >= 90

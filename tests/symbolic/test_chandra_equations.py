@@ -76,16 +76,18 @@ def test_the_docstring_names_the_equation(number):
 
 @PROPERTY
 @given(rotation_vectors, vectors, unit_vectors, vectors, st.floats(-1, 1))
-def test_eqs_1_2_a_line_is_left_in_place_by_a_screw_about_it(w, moved, axis, point, distance):
+def test_eqs_1_2_a_line_is_left_in_place_by_a_screw_about_it(
+    w, distance_along, axis, point, distance
+):
     angle = float(np.linalg.norm(w))
     line = dq.directed_line(ca.DM(axis), ca.DM(point))
     x = dq.exp_screw(angle, distance, *line)
     assert float(ca.dot(*line)) == pytest.approx(0, abs=1e-14)
     np.testing.assert_allclose(np.array(dq.norm(x)).ravel(), [1, 0], atol=1e-14)
-    for found, expected in zip(dq.act_on_line(x, *line), line, strict=True):
-        np.testing.assert_allclose(np.array(found), np.array(expected), atol=1e-13)
-    along = dq.act_on_point(x, ca.DM(point)) - ca.DM(point)
-    np.testing.assert_allclose(np.array(along).ravel(), distance * axis, atol=1e-13)
+    for result, expected in zip(dq.act_on_line(x, *line), line, strict=True):
+        np.testing.assert_allclose(np.array(result), np.array(expected), atol=1e-13)
+    shift = dq.act_on_point(x, ca.DM(point)) - ca.DM(point)
+    np.testing.assert_allclose(np.array(shift).ravel(), distance * axis, atol=1e-13)
     # The same motion in SE(3): the twist theta (l, m) + d (0, l).
     R, p = se3.exp_se3(ca.vertcat(angle * line[1] + distance * line[0], angle * line[0]))
     np.testing.assert_allclose(np.array(dq.to_pose(x)[0]), np.array(R), atol=1e-12)
@@ -104,10 +106,10 @@ def test_eqs_3_to_7_12_finger_jacobians_are_the_tips_twist(kind, toy, robot, rng
         frame = kinematics.kinematics.contact_frame(finger)
         point = dq.translation(motion.pose)
         geometric = kinematics.contact_jacobian(finger, tip.actuators)
-        moved = motion.jacobian[:3, :] + ca.horzcat(
+        columns = motion.jacobian[:3, :] + ca.horzcat(
             *(ca.cross(column, point) for column in ca.horzsplit(motion.jacobian[3:, :]))
         )
-        outputs = (*dq.to_pose(motion.pose), frame.rotation, frame.origin, motion.jacobian, moved)
+        outputs = (*dq.to_pose(motion.pose), frame.rotation, frame.origin, motion.jacobian, columns)
         for row in 0.1 * body.home + 0.9 * body.random(rng, 5):
             values = evaluated(*outputs, *geometric, q=q, at=row)
             R, p, R_se3, p_se3, jacobian, linear, linear_se3, angular_se3 = values
@@ -117,8 +119,8 @@ def test_eqs_3_to_7_12_finger_jacobians_are_the_tips_twist(kind, toy, robot, rng
             np.testing.assert_allclose(linear, linear_se3, atol=1e-12 * scale)
             np.testing.assert_allclose(jacobian[3:], angular_se3, atol=1e-12 * scale)
             differences = twist_by_differences(tip, row)
-            others = [i for i in range(len(row)) if i not in tip.actuators]
-            assert np.abs(differences[:, others]).max(initial=0) == 0
+            other_columns = [i for i in range(len(row)) if i not in tip.actuators]
+            assert np.abs(differences[:, other_columns]).max(initial=0) == 0
             np.testing.assert_allclose(
                 jacobian, differences[:, tip.actuators], atol=1e-6 * max(scale, 1)
             )
@@ -135,8 +137,8 @@ def test_eq_12_is_the_display_of_the_paper(toy, rng):
     s = motion.screws.jacobian  # left_spread, left_1, left_2, left_3, left_4
     printed = ca.horzcat(s[:, 0], s[:, 1], s[:, 2] + f * (s[:, 3] - 0.5 * s[:, 4]))
     for row in toy.random(rng, 5):
-        found, expected = evaluated(motion.joint_jacobian, printed, q=q, at=row)
-        np.testing.assert_allclose(found, expected, atol=1e-13)
+        value, expected = evaluated(motion.joint_jacobian, printed, q=q, at=row)
+        np.testing.assert_allclose(value, expected, atol=1e-13)
 
 
 def test_eqs_8_10_rates_are_those_of_the_couplings(toy, rng):
@@ -236,11 +238,13 @@ def test_eqs_13_14_17_the_control_twist_removes_its_part_of_the_error(w1, p1, w2
         return
     w, v = dq.control_twist(e, gain)
     after = dq.error(dq.multiply(dq.exp(w, v), current), desired)
-    before = float(dq.screw_error_norm(e))
-    assert float(dq.screw_error_norm(after)) == pytest.approx((1 - gain) * before, abs=1e-10)
-    whole = dq.log(e)
-    assert before == pytest.approx(np.linalg.norm(np.array(ca.vertcat(*whole))), abs=1e-12)
+    norm_before = float(dq.screw_error_norm(e))
+    assert float(dq.screw_error_norm(after)) == pytest.approx((1 - gain) * norm_before, abs=1e-10)
+    whole_twist = dq.log(e)
+    assert norm_before == pytest.approx(
+        np.linalg.norm(np.array(ca.vertcat(*whole_twist))), abs=1e-12
+    )
     # The same error in SE(3): T_c T_d^-1.
     R, p = se3.compose(dq.to_pose(current), se3.inverse(dq.to_pose(desired)))
     twist = np.array(se3.log_se3((R, p))).ravel()
-    np.testing.assert_allclose(np.array(ca.vertcat(*whole[::-1])).ravel(), twist, atol=1e-9)
+    np.testing.assert_allclose(np.array(ca.vertcat(*whole_twist[::-1])).ravel(), twist, atol=1e-9)

@@ -52,14 +52,14 @@ def chain(request, robot):
 
 def samples(robot, rng, evaluate, count=25):
     """Configurations away from the chain's singularities, with a random active step each."""
-    found = []
+    chains = []
     for q in robot.random(rng, 20 * count):
         step = rng.normal(size=4)
         values = evaluate(q, step)
         if np.abs(values["H"]).max() < 50:
-            found.append((q, step, values))
-        if len(found) == count:
-            return found
+            chains.append((q, step, values))
+        if len(chains) == count:
+            return chains
     raise AssertionError("hardly any regular configuration")
 
 
@@ -89,12 +89,12 @@ def test_thumb_keeps_its_contact(chain, robot, rng):
     _, _, evaluate = chain
     for _, _, values in samples(robot, rng, evaluate):
         motors, jacobian = values["motors"].ravel(), values["thumb"]
-        moved = np.abs(jacobian[:3]) @ np.abs(motors)
-        np.testing.assert_array_less(np.abs(jacobian[:3] @ motors), 1e-9 * moved)
-        turned = np.abs(jacobian[3:]) @ np.abs(motors)
+        translation_bound = np.abs(jacobian[:3]) @ np.abs(motors)
+        np.testing.assert_array_less(np.abs(jacobian[:3] @ motors), 1e-9 * translation_bound)
+        rotation_bound = np.abs(jacobian[3:]) @ np.abs(motors)
         normal = values["normal"].ravel()
         slip = np.cross(jacobian[3:] @ motors, normal)
-        assert np.linalg.norm(slip) < 1e-9 * np.linalg.norm(turned)
+        assert np.linalg.norm(slip) < 1e-9 * np.linalg.norm(rotation_bound)
         # It turns about its normal though, at the virtual joint's rate.
         assert abs(normal @ jacobian[3:] @ motors) > 1e-6
 
@@ -228,8 +228,8 @@ def test_rows_two_to_six_of_h_are_the_arms(robot, rng):
     thumb_1 = robot.actuators.index("bh_thumb_proximal")
     order = [thumb_1, 0, 1, 2, 3, 4]
     H = chain.H[[parts.passive.index(c) for c in order], :]
-    turned = body.kinematics.palm.rotation.T
-    twist = ca.vertcat(*(turned @ rows for rows in body.palm_jacobian(range(6))))
+    palm_axes = body.kinematics.palm.rotation.T
+    twist = ca.vertcat(*(palm_axes @ rows for rows in body.palm_jacobian(range(6))))
     last = ca.DM([[0, 0, 0, 1]])
     assert parts.active == (VIRTUAL, robot.actuators.index("bh_thumb_distal"), 6, 5)
     right, printed = (twist @ ca.vertcat(rows, last) for rows in (H[1:, :], H[:5, :]))
@@ -286,22 +286,24 @@ def cases(robot, rng, problem, count):
 
 def test_unlimited_both_take_the_same_step(robot, problem, steps, rng):
     """The projector's formula is the minimiser under the thumb's equations."""
-    far = np.full(14, WIDE)
+    unlimited = np.full(14, WIDE)
     for damping in (0.03, 1.0):
         for _, linear in cases(robot, rng, problem, 15):
-            (one, held), (other, _) = (f(*linear, -far, far, damping) for f in steps)
-            one, other = np.array(one).ravel(), np.array(other).ravel()
-            assert not np.array(held).any()
-            np.testing.assert_allclose(one, other, atol=1e-5 * max(1.0, np.abs(one).max()))
-            thumb, error, rows, rest = linear
+            (step_a, multipliers), (step_b, _) = (
+                f(*linear, -unlimited, unlimited, damping) for f in steps
+            )
+            step_a, step_b = np.array(step_a).ravel(), np.array(step_b).ravel()
+            assert not np.array(multipliers).any()
+            np.testing.assert_allclose(step_a, step_b, atol=1e-5 * max(1.0, np.abs(step_a).max()))
+            thumb, error, rows, other_rows = linear
             # The thumb gets what its own damped step would give it.
             damped = thumb @ thumb.T + max(THUMB_DAMPING, damping) ** 2 * np.eye(5)
-            wanted = thumb @ thumb.T @ np.linalg.solve(damped, error)
-            np.testing.assert_allclose(thumb @ one, wanted.ravel(), atol=1e-6)
+            expected_step = thumb @ thumb.T @ np.linalg.solve(damped, error)
+            np.testing.assert_allclose(thumb @ step_a, expected_step.ravel(), atol=1e-6)
             # And no motion of the closed chain would serve the others better.
             null = np.linalg.svd(thumb)[2][5:].T
-            slope = null.T @ (rows.T @ (rows @ one - rest.ravel()) + damping**2 * one)
-            assert np.abs(slope).max() < 1e-4 * np.abs(null.T @ rows.T @ rest).max() + 1e-9
+            slope = null.T @ (rows.T @ (rows @ step_a - other_rows.ravel()) + damping**2 * step_a)
+            assert np.abs(slope).max() < 1e-4 * np.abs(null.T @ rows.T @ other_rows).max() + 1e-9
 
 
 def test_both_keep_to_the_limits(robot, problem, steps, rng):
@@ -309,17 +311,20 @@ def test_both_keep_to_the_limits(robot, problem, steps, rng):
     fixed, agree, total = 0, 0, 0
     for q, linear in cases(robot, rng, problem, 40):
         lower, upper = robot.lower - q, robot.upper - q
-        (one, held), (other, _) = (f(*linear, lower, upper, 0.03) for f in steps)
-        one, other, held = (np.array(x).ravel() for x in (one, other, held))
-        for step in (one, other):
+        (step_a, multipliers), (step_b, _) = (f(*linear, lower, upper, 0.03) for f in steps)
+        step_a, step_b, multipliers = (np.array(x).ravel() for x in (step_a, step_b, multipliers))
+        for step in (step_a, step_b):
             assert (step >= lower).all()
             assert (step <= upper).all()
-        at = held > 0
+        at = multipliers > 0
         np.testing.assert_allclose(
-            np.minimum(one - lower, upper - one)[at], 0.0, atol=1e-9, err_msg="held off its limit"
+            np.minimum(step_a - lower, upper - step_a)[at],
+            0.0,
+            atol=1e-9,
+            err_msg="held off its limit",
         )
         fixed += at.any()
-        agree += np.abs(one - other).max() < 1e-3
+        agree += np.abs(step_a - step_b).max() < 1e-3
         total += 1
     assert fixed > 10
     # Joints once fixed are not let go again, which the program may do: seldom another answer.

@@ -85,10 +85,12 @@ def test_contact_jacobians(pair, rng):
             slope = difference(lambda x, i=i: robot.contacts(x)[0][i], q)
             scale = max(1.0, np.abs(linear).max())
             np.testing.assert_allclose(linear, slope, atol=1e-8 * scale)
-            turned = difference(lambda x, i=i: robot.contacts(x)[1][i], q)
+            normal_rates = difference(lambda x, i=i: robot.contacts(x)[1][i], q)
             normal = robot.contacts(q)[1][i]
             scale = max(1.0, np.abs(angular).max())
-            np.testing.assert_allclose(np.cross(angular.T, normal).T, turned, atol=1e-8 * scale)
+            np.testing.assert_allclose(
+                np.cross(angular.T, normal).T, normal_rates, atol=1e-8 * scale
+            )
 
 
 def test_palm_jacobians(pair, rng):

@@ -31,10 +31,10 @@ def test_solve_is_backward_stable_up_to_condition_1e12():
     for _ in range(300):
         decades = random.uniform(0, 12)
         A, x = conditioned(random, 6, decades), random.standard_normal((6, 4))
-        found = solve(A, A @ x).full()
-        assert np.abs(found - x).max() < 1e-14 * 10**decades
-        residual = np.linalg.norm(A @ found - A @ x, axis=0)
-        assert np.all(residual < 4e-15 * np.linalg.norm(A) * np.linalg.norm(found, axis=0))
+        solution = solve(A, A @ x).full()
+        assert np.abs(solution - x).max() < 1e-14 * 10**decades
+        residual = np.linalg.norm(A @ solution - A @ x, axis=0)
+        assert np.all(residual < 4e-15 * np.linalg.norm(A) * np.linalg.norm(solution, axis=0))
 
 
 def test_solve_needs_no_lucky_diagonal():
@@ -79,12 +79,12 @@ def test_damped_least_squares(shape):
         J, e = random.standard_normal(shape), random.standard_normal(m)
         lam, w = 10 ** random.uniform(-3, 0), random.uniform(0.2, 5, n)
         rhs = np.concatenate([e, np.zeros(n)])
-        for found, damping in (
+        for step_found, damping in (
             (dls(J, e, lam), lam * np.eye(n)),
             (weighted(J, e, lam, w), lam * np.diag(np.sqrt(w))),
         ):
             expected = np.linalg.lstsq(np.vstack([J, damping]), rhs)[0]
-            assert np.allclose(found.full()[:, 0], expected, rtol=1e-11, atol=1e-12)
+            assert np.allclose(step_found.full()[:, 0], expected, rtol=1e-11, atol=1e-12)
         equal = weighted(J, e, lam, np.ones(n)).full()
         assert np.allclose(equal, dls(J, e, lam).full(), rtol=0, atol=1e-12)
     assert np.array_equal(dls(np.zeros(shape), e, 0.1).full(), np.zeros((n, 1)))
@@ -106,8 +106,8 @@ def test_pseudoinverse_and_null_space(shape):
         e = J @ x
         expected = x - np.linalg.pinv(J) @ e
         assert np.allclose(project(J, x).full()[:, 0], expected, rtol=0, atol=10 * tolerance)
-        found = pinv(J, e).full()[:, 0]
-        assert np.allclose(found, np.linalg.pinv(J) @ e, rtol=0, atol=10 * tolerance)
+        solution = pinv(J, e).full()[:, 0]
+        assert np.allclose(solution, np.linalg.pinv(J) @ e, rtol=0, atol=10 * tolerance)
 
 
 SHAPES = [(3, 9), (2, 9), (6, 4), (6, 6), (3, 3), (1, 5), (6, 14)]
@@ -216,11 +216,13 @@ def step():
 
     def call(*inputs, passes=4):
         if passes not in functions:
-            found = damped_step(J, r, damping, BoxBounds(value, lower, upper, FIRST), passes)
+            bounded_step = damped_step(J, r, damping, BoxBounds(value, lower, upper, FIRST), passes)
             symbols = [J, r, damping, value, lower, upper]
-            functions[passes] = ca.Function("step", symbols, [found.step, found.predicted_decrease])
-        s, promised = functions[passes](*inputs)
-        return np.array(s).ravel(), float(promised)
+            functions[passes] = ca.Function(
+                "step", symbols, [bounded_step.step, bounded_step.predicted_decrease]
+            )
+        s, predicted = functions[passes](*inputs)
+        return np.array(s).ravel(), float(predicted)
 
     return call
 
@@ -250,27 +252,27 @@ def exact(J, r, damping, value, lower, upper):
 def test_without_active_bounds_it_is_the_damped_least_squares_step(step, rng):
     for _ in range(20):
         J, r, damping, value, lower, upper = problem(rng, 1.0)
-        s, promised = step(J, r, damping, 0 * value, lower - 100, upper + 100)
+        s, predicted = step(J, r, damping, 0 * value, lower - 100, upper + 100)
         expected = -np.linalg.solve(J.T @ J + damping * np.eye(N), J.T @ r)
         np.testing.assert_allclose(s, expected, atol=1e-10)
-        assert promised == pytest.approx(r @ r - np.sum((r + J @ expected) ** 2))
+        assert predicted == pytest.approx(r @ r - np.sum((r + J @ expected) ** 2))
 
 
 @pytest.mark.parametrize("tight", [0.05, 0.3, 1.0])
 def test_enough_passes_give_the_exact_solution(step, rng, tight):
-    same, held = 0, 0
+    same_count, bound_count = 0, 0
     for _ in range(100):
         inputs = problem(rng, tight)
         _, _, _, value, lower, upper = inputs
         s, expected = step(*inputs, passes=6)[0], exact(*inputs)
-        there = value + s[FIRST:]
-        assert (there >= lower - 1e-12).all()
-        assert (there <= upper + 1e-12).all()
-        same += np.allclose(s, expected, atol=1e-6)
-        held += np.sum((there <= lower + 1e-12) | (there >= upper - 1e-12))
+        new_value = value + s[FIRST:]
+        assert (new_value >= lower - 1e-12).all()
+        assert (new_value <= upper + 1e-12).all()
+        same_count += np.allclose(s, expected, atol=1e-6)
+        bound_count += np.sum((new_value <= lower + 1e-12) | (new_value >= upper - 1e-12))
     # The method is no cure-all for any quadratic, but nearly so for a handful of coordinates.
-    assert same >= 95
-    assert held > 50
+    assert same_count >= 95
+    assert bound_count > 50
 
 
 @pytest.mark.parametrize("passes", [1, 2, 4])
@@ -279,12 +281,12 @@ def test_every_step_descends_and_stays_within(step, rng, passes):
     for _ in range(100):
         inputs = problem(rng, 0.3)
         J, r, _, value, lower, upper = inputs
-        s, promised = step(*inputs, passes=passes)
-        there = value + s[FIRST:]
-        assert (there >= lower - 1e-12).all()
-        assert (there <= upper + 1e-12).all()
-        assert promised == pytest.approx(r @ r - np.sum((r + J @ s) ** 2), abs=1e-9)
-        ascents += promised < 0
+        s, predicted = step(*inputs, passes=passes)
+        new_value = value + s[FIRST:]
+        assert (new_value >= lower - 1e-12).all()
+        assert (new_value <= upper + 1e-12).all()
+        assert predicted == pytest.approx(r @ r - np.sum((r + J @ s) ** 2), abs=1e-9)
+        ascents += predicted < 0
     assert ascents <= (5 if passes == 1 else 0)
 
 
@@ -325,19 +327,19 @@ def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng, full):
     J = fingers()
     r, damping = ca.SX.sym("r", J.shape[0]), ca.SX.sym("damping")
     value, lower, upper = (ca.SX.sym(name, count - PALM) for name in ("value", "lower", "upper"))
-    rows, rest = ca.SX.sym("rows", full, count), ca.SX.sym("rest", full)
+    rows, other_part = ca.SX.sym("rows", full, count), ca.SX.sym("rest", full)
     bounded = BoxBounds(value, lower, upper, PALM)
-    found = damped_step(J, r, damping, bounded, 6, (rows, rest) if full else None)
-    inputs = [ca.vertcat(*J.nonzeros()), r, rows, rest, damping, value, lower, upper]
-    step = ca.Function("step", inputs, [found.step, found.predicted_decrease])
-    same, held = 0, 0
+    bounded_step = damped_step(J, r, damping, bounded, 6, (rows, other_part) if full else None)
+    inputs = [ca.vertcat(*J.nonzeros()), r, rows, other_part, damping, value, lower, upper]
+    step = ca.Function("step", inputs, [bounded_step.step, bounded_step.predicted_decrease])
+    same_count, bound_count = 0, 0
     for _ in range(10):
         numbers, concern_all = rng.normal(size=J.nnz()), rng.normal(size=(full, count))
         dense = np.vstack([ca.DM(J.sparsity(), numbers).full(), concern_all])
         low, high = -rng.uniform(0, 0.3, count - PALM), rng.uniform(0, 0.3, count - PALM)
         at, right = rng.uniform(low, high), rng.normal(size=len(dense))
         split = np.split(right, [J.shape[0]])
-        s, promised = step(numbers, split[0], concern_all, split[1], 1e-2, at, low, high)
+        s, predicted = step(numbers, split[0], concern_all, split[1], 1e-2, at, low, high)
         s = np.array(s).ravel()
         matrix = np.vstack([dense, 0.1 * np.eye(count)])
         free = np.full(PALM, np.inf)
@@ -345,18 +347,18 @@ def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng, full):
         expected = lsq_linear(
             matrix, np.r_[-right, np.zeros(count)], ends, method="bvls", tol=1e-14
         )
-        same += np.allclose(s, expected.x, atol=1e-6)
-        held += np.sum(np.isclose(at + s[PALM:], low) | np.isclose(at + s[PALM:], high))
-        assert float(promised) == pytest.approx(right @ right - np.sum((right + dense @ s) ** 2))
-    assert same >= 8
-    assert held > 10
+        same_count += np.allclose(s, expected.x, atol=1e-6)
+        bound_count += np.sum(np.isclose(at + s[PALM:], low) | np.isclose(at + s[PALM:], high))
+        assert float(predicted) == pytest.approx(right @ right - np.sum((right + dense @ s) ** 2))
+    assert same_count >= 8
+    assert bound_count > 10
 
 
 def fingers():
     """A Jacobian of fingers with joints of their own on a palm that moves them all."""
     rows = []
     for i in range(FINGERS):
-        own = [ca.SX(6, JOINTS) for _ in range(FINGERS)]
-        own[i] = ca.SX.sym(f"own{i}", 6, JOINTS)
-        rows.append(ca.horzcat(ca.SX.sym(f"palm{i}", 6, PALM), *own))
+        finger_columns = [ca.SX(6, JOINTS) for _ in range(FINGERS)]
+        finger_columns[i] = ca.SX.sym(f"own{i}", 6, JOINTS)
+        rows.append(ca.horzcat(ca.SX.sym(f"palm{i}", 6, PALM), *finger_columns))
     return ca.vertcat(*rows)

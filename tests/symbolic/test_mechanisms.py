@@ -34,12 +34,12 @@ toggle = graph(lambda phi, b: mechanisms.linkage_toggle(phi, bar(b)), S, B)
 def linkages(count: int, seed: int = 3):
     """Random linkages of both branches, at least 1e-3 of sin^2 away from a toggle."""
     rng = np.random.default_rng(seed)
-    found = 0
-    while found < count:
+    found_count = 0
+    while found_count < count:
         lengths, phi = rng.uniform(0.3, 2, 4), rng.uniform(-np.pi, np.pi)
         b = np.array([*lengths, rng.choice([-1.0, 1.0])])
         if float(toggle(phi, b)) > 1e-3:
-            found += 1
+            found_count += 1
             yield b, phi
 
 
@@ -70,13 +70,13 @@ def test_rates_match_central_differences_ad_and_eq_11_with_the_crank():
         if float(toggle(phi, b)) < 1e-2:
             continue
         theta, rod = float(theta3(phi, b, 0)), float(psi(phi, b))
-        found = float(f(phi, b))
+        slope = float(f(phi, b))
         difference = float(theta3(phi + step, b, theta) - theta3(phi - step, b, theta)) / (2 * step)
-        assert found == pytest.approx(difference, rel=1e-6, abs=1e-6)
-        assert found == pytest.approx(float(theta_ad(phi, b)[0]), rel=1e-9, abs=1e-9)
+        assert slope == pytest.approx(difference, rel=1e-6, abs=1e-6)
+        assert slope == pytest.approx(float(theta_ad(phi, b)[0]), rel=1e-9, abs=1e-9)
         lever = h * np.sin(phi + theta - rod)
-        assert found == pytest.approx((p * np.sin(rod - phi) - lever) / lever, rel=1e-9, abs=1e-9)
-        wrong.append(abs((g * np.sin(rod - phi) - lever) / lever - found))
+        assert slope == pytest.approx((p * np.sin(rod - phi) - lever) / lever, rel=1e-9, abs=1e-9)
+        wrong.append(abs((g * np.sin(rod - phi) - lever) / lever - slope))
     assert np.median(wrong) > 0.1  # a = g in eq. (11) is not a rounding matter
 
 
@@ -134,8 +134,8 @@ def test_theta3_is_continuous_into_the_toggle():
     measures = np.array([float(toggle(x, b)) for x in phis])
     last = int(np.flatnonzero(measures > 0)[-1])
     assert measures[last + 1] < 0
-    inside, outside = float(theta3(phis[last], b, 0)), float(theta3(phis[last + 1], b, 0))
-    assert abs(inside - outside) < 0.05
+    inner_angle, outside = float(theta3(phis[last], b, 0)), float(theta3(phis[last + 1], b, 0))
+    assert abs(inner_angle - outside) < 0.05
 
 
 S = (1, 1)
@@ -163,12 +163,12 @@ def test_ar10_stroke(name):
         theta = float(angle(s, b, c))
         acos = np.arccos((b * b + c * c - s * s) / (2 * b * c))
         assert theta == pytest.approx(acos, abs=1e-14)
-        found = float(rate(s, b, c))
-        assert found == pytest.approx(float(angle_gradient(s, b, c)[0]), rel=1e-13)
-        assert found == pytest.approx(s / (b * c * np.sin(theta)), rel=1e-12)
+        slope = float(rate(s, b, c))
+        assert slope == pytest.approx(float(angle_gradient(s, b, c)[0]), rel=1e-13)
+        assert slope == pytest.approx(s / (b * c * np.sin(theta)), rel=1e-12)
         difference = central_difference(angle, s, b, c, step=1e-8)[0, 0]
-        assert found == pytest.approx(difference, rel=1e-6)
-        rates.append(found)
+        assert slope == pytest.approx(difference, rel=1e-6)
+        rates.append(slope)
     assert min(rates) > 70
     assert max(rates) < 140
 

@@ -55,12 +55,12 @@ def test_exp_agrees_with_pinocchio(v, w):
 @given(vectors, rotation_vectors)
 def test_log_undoes_exp(v, w):
     twist = np.concatenate([v, w])
-    found = log(*exp(twist)).full()[:, 0]
-    assert np.allclose(found, twist, rtol=0, atol=2e-14)
-    assert np.allclose(found[3:], w, rtol=1e-15, atol=4e-15)
+    logarithm = log(*exp(twist)).full()[:, 0]
+    assert np.allclose(logarithm, twist, rtol=0, atol=2e-14)
+    assert np.allclose(logarithm[3:], w, rtol=1e-15, atol=4e-15)
     if np.linalg.norm(w) < np.pi - 1e-3:
         expected = pin.log6(pin.exp6(pin.Motion(v, w))).vector
-        assert np.allclose(found, expected, rtol=0, atol=1e-11)
+        assert np.allclose(logarithm, expected, rtol=0, atol=1e-11)
 
 
 @PROPERTY
@@ -140,9 +140,9 @@ def test_rpy_is_the_urdf_convention(rpy_angles):
 @pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
 def test_gimbal_lock_keeps_the_rotation(pitch):
     R = pin.rpy.rpyToMatrix(0.4, pitch, -0.3)
-    found = to_rpy(R).full()[:, 0]
-    assert found[0] == 0
-    assert np.allclose(pin.rpy.rpyToMatrix(found), R, rtol=0, atol=1e-15)
+    angles_read = to_rpy(R).full()[:, 0]
+    assert angles_read[0] == 0
+    assert np.allclose(pin.rpy.rpyToMatrix(angles_read), R, rtol=0, atol=1e-15)
     assert gradient(se3.matrix_to_rpy, M)(R).is_regular()
     assert euler_inverse([0.4, pitch, 0.1]).is_regular()
 
@@ -208,7 +208,7 @@ gradients = [gradient(f, V, V) for f in (se3.angle_between, se3.normal_error, se
 SPECIAL = [np.array(v, float) for v in ([0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0])]
 
 
-def turned(n: np.ndarray, w: np.ndarray, theta: float) -> tuple[np.ndarray, np.ndarray]:
+def rotated_line(n: np.ndarray, w: np.ndarray, theta: float) -> tuple[np.ndarray, np.ndarray]:
     """The unit axis perpendicular to n nearest to w, and n turned about it by theta."""
     axis = np.cross(n, np.cross(w, n))
     axis /= np.linalg.norm(axis)
@@ -229,7 +229,7 @@ def test_error_turns_current_into_desired(n, w, theta):
         w = np.roll(n, 1) * [1, -1, 1]
     if np.linalg.norm(np.cross(n, w)) < 0.1:
         return
-    axis, d = turned(n, w, theta)
+    axis, d = rotated_line(n, w, theta)
     # Rounding the two normals moves their angle by about 1e-16, hence the direction by 1e-16/sin.
     slack = 1e-15 / max(np.sin(theta), 1e-15)
     assert abs(float(angle(n, d)) - theta) < 1e-15
@@ -401,14 +401,14 @@ def test_poses_multiply_like_transforms(A, B, x):
 @given(poses, unit_vectors, vectors)
 def test_lines_move_with_their_points(A, direction, point):
     moment = np.cross(point, direction)
-    moved, moved_moment = (full(x) for x in on_line(number(A), direction, moment))
-    assert np.allclose(moved, A.rotation @ direction, rtol=0, atol=4e-15)
-    assert np.allclose(moved_moment, np.cross(A.act(point), moved), rtol=0, atol=6e-15)
+    moved_direction, moved_moment = (full(x) for x in on_line(number(A), direction, moment))
+    assert np.allclose(moved_direction, A.rotation @ direction, rtol=0, atol=4e-15)
+    assert np.allclose(moved_moment, np.cross(A.act(point), moved_direction), rtol=0, atol=6e-15)
     # Eq. (6) literally: x s x* with the classical conjugate.
     x = number(A)
     s = np.concatenate([[0], direction, [0], moment])
     literal = full(multiply(multiply(x, s), conjugate(x)))
-    assert np.allclose(literal, [0, *moved, 0, *moved_moment], rtol=0, atol=6e-15)
+    assert np.allclose(literal, [0, *moved_direction, 0, *moved_moment], rtol=0, atol=6e-15)
 
 
 @PROPERTY

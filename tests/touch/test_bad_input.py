@@ -26,7 +26,7 @@ def cache(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "given",
+    "options",
     [
         {name: value}
         for name, values in {
@@ -53,9 +53,9 @@ def cache(tmp_path, monkeypatch):
     ],
     ids=str,
 )
-def test_questions_of_wrong_type_or_value(solver, given):
+def test_questions_of_wrong_type_or_value(solver, options):
     with pytest.raises(errors.InputError):
-        solver.grasps_of("tomato_soup_can", **{"pose": PLACE, **given})
+        solver.grasps_of("tomato_soup_can", **{"pose": PLACE, **options})
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_names_of_nothing(solver, name):
 
 
 @pytest.mark.parametrize(
-    "given",
+    "options",
     [
         *({"scale": value} for value in ("x", None, 0, -1.0, np.nan, np.inf, [1.0])),
         *({"seed": value} for value in ("x", None, -1, 1.5)),
@@ -100,18 +100,18 @@ def test_names_of_nothing(solver, name):
     ],
     ids=str,
 )
-def test_wrong_options_of_surfaces(given):
+def test_wrong_options_of_surfaces(options):
     with pytest.raises(errors.InputError):
-        ik.load_surface((BOX.vertices, BOX.faces), **given)
+        ik.load_surface((BOX.vertices, BOX.faces), **options)
 
 
 @pytest.mark.parametrize(
-    "given", [{"position": "x"}, {"angle": None}, {"samples": 1.5}, {"seed": -1}, {"hold": 3}]
+    "options", [{"position": "x"}, {"angle": None}, {"samples": 1.5}, {"seed": -1}, {"hold": 3}]
 )
-def test_wrong_displacements(solver, given):
-    found = solver.grasps_of("tomato_soup_can", PLACE, limit=1, among=1)
+def test_wrong_displacements(solver, options):
+    grasps = solver.grasps_of("tomato_soup_can", PLACE, limit=1, among=1)
     with pytest.raises(errors.InputError):
-        found.robustness(**given)
+        grasps.robustness(**options)
 
 
 @pytest.mark.parametrize(
@@ -139,8 +139,8 @@ def test_meshes_without_a_file_are_grasped(solver, tmp_path, source):
     surface = ik.load_surface(source)
     np.testing.assert_allclose(surface.points, ik.load_surface(tmp_path / "box.off").points)
     assert ik.load_surface(source).name == surface.name
-    found = solver.grasps_of(source, PLACE, limit=2, among=2)
-    assert len(found) == 2
-    assert all(solver.solve(grasp.grasp, q0=grasp.q).success for grasp in found)
-    half = ik.load_surface(source, scale=0.5)
-    assert half.size == pytest.approx(surface.size / 2, rel=1e-3)
+    grasps = solver.grasps_of(source, PLACE, limit=2, among=2)
+    assert len(grasps) == 2
+    assert all(solver.solve(grasp.grasp, q0=grasp.q).success for grasp in grasps)
+    half_size = ik.load_surface(source, scale=0.5)
+    assert half_size.size == pytest.approx(surface.size / 2, rel=1e-3)

@@ -41,7 +41,7 @@ def surface(tmp_path_factory):
 
 
 @pytest.fixture(scope="module", params=["panda+panda_hand", "panda+allegro_right"])
-def found(request, surface):
+def grasps_found(request, surface):
     solver = solver_of(request.param)
     return solver, solver.grasps_of(surface, PLACE, limit=12, among=12, seed=1)
 
@@ -57,22 +57,22 @@ def test_samples_lie_on_the_surface_and_face_outwards(surface):
     assert not surface.fits_pad[near_edge].any()
 
 
-def test_every_grasp_is_confirmed_in_the_scene(found):
-    solver, grasps = found
+def test_every_grasp_is_confirmed_in_the_scene(grasps_found):
+    solver, grasps = grasps_found
     assert len(grasps) == 12
-    for one in grasps:
-        assert solver.solve(one.grasp, q0=one.q).success
-        assert one.clearance >= 0
+    for grasp in grasps:
+        assert solver.solve(grasp.grasp, q0=grasp.q).success
+        assert grasp.clearance >= 0
         assert list(grasps.counts.values()) == sorted(grasps.counts.values(), reverse=True)
 
 
-def test_what_is_written_is_what_was_found(found):
-    solver, grasps = found
-    held = np.load(io.BytesIO(grasps_npz(grasps, solver.robot.fingers)))
-    asked = {name: held[name] for name in ("points", "normals", "balls") if name in held}
-    batch = solver.solve_batch(**asked, q0=held["q"])
+def test_what_is_written_is_what_was_found(grasps_found):
+    solver, grasps = grasps_found
+    stored = np.load(io.BytesIO(grasps_npz(grasps, solver.robot.fingers)))
+    arrays = {name: stored[name] for name in ("points", "normals", "balls") if name in stored}
+    batch = solver.solve_batch(**arrays, q0=stored["q"])
     assert batch.success.all()
-    np.testing.assert_allclose(batch.q, held["q"], atol=1e-9)
+    np.testing.assert_allclose(batch.q, stored["q"], atol=1e-9)
     assert np.nanmax(batch.position_error) < 1e-9
 
 
@@ -88,28 +88,28 @@ def test_things_beside_the_object_are_kept_clear_of(surface):
         }
     )
     solver = ik.Solver(ik.load_robot("panda+allegro_right"), scene=scene)
-    found = solver.grasps_of(surface, PLACE, limit=10, among=10)
-    assert len(found) == 10
-    for one in found:
-        assert solver.solve(one.grasp, q0=one.q).success
-        assert one.clearance is not None
-        assert one.clearance >= 0
+    grasps_found = solver.grasps_of(surface, PLACE, limit=10, among=10)
+    assert len(grasps_found) == 10
+    for grasp in grasps_found:
+        assert solver.solve(grasp.grasp, q0=grasp.q).success
+        assert grasp.clearance is not None
+        assert grasp.clearance >= 0
 
 
-def test_fingertips_touch_the_mesh(found):
+def test_fingertips_touch_the_mesh(grasps_found):
     """By distances of the pads, balls or points, to the exact cylinder."""
-    solver, grasps = found
+    solver, grasps = grasps_found
     inverse = np.linalg.inv(PLACE)
-    for one in grasps:
-        frames = solver.robot.contact_frames(one.q)
-        for name, contact in one.grasp.contacts.items():
+    for grasp in grasps:
+        frames = solver.robot.contact_frames(grasp.q)
+        for name, contact in grasp.grasp.contacts.items():
             finger = solver.robot.description.finger(name)
             tip = frames[solver.robot.fingers.index(name)]
             middle = tip[:3, 3] - finger.radius * tip[:3, 0]
             local = inverse[:3, :3] @ middle + inverse[:3, 3]
             off = np.array([np.linalg.norm(local[:2]) - 0.033, abs(local[2]) - 0.05])
-            far = np.linalg.norm(np.maximum(off, 0)) + min(off.max(), 0)
-            assert far == pytest.approx(finger.radius, abs=1.1e-3)
+            distance = np.linalg.norm(np.maximum(off, 0)) + min(off.max(), 0)
+            assert distance == pytest.approx(finger.radius, abs=1.1e-3)
             lid = off[1] > off[0]
             face = [0, 0, np.sign(local[2])] if lid else local * [1, 1, 0]
             face = inverse[:3, :3].T @ face / np.linalg.norm(face)
@@ -131,26 +131,26 @@ def test_no_pad_hovers_beyond_an_edge():
     pose[:3, :3] = [[0.5, 0, 0.5 * 3**0.5], [0.5 * 3**0.5, 0, -0.5], [0, 1, 0]]
     pose[:3, 3] = [0.5, 0.1, 0.047]
     surface = ik.load_surface("sugar_box")
-    half = np.abs(surface.points).max(axis=0)
-    found = solver.grasps_of(surface, pose, limit=60, among=60)
-    assert len(found) == 60
-    for one in found:
-        points, normals = solver.robot.contacts(one.q)
-        for name in one.grasp.contacts:
+    half_extents = np.abs(surface.points).max(axis=0)
+    grasps_found = solver.grasps_of(surface, pose, limit=60, among=60)
+    assert len(grasps_found) == 60
+    for grasp in grasps_found:
+        points, normals = solver.robot.contacts(grasp.q)
+        for name in grasp.grasp.contacts:
             i, radius = (
                 solver.robot.fingers.index(name),
                 solver.robot.description.finger(name).radius,
             )
             local = np.linalg.inv(pose) @ np.append(points[i] - radius * normals[i], 1.0)
-            beyond = np.abs(local[:3]) - half
-            far = np.linalg.norm(np.maximum(beyond, 0)) + min(beyond.max(), 0)
-            assert far == pytest.approx(radius, abs=1.1e-3)
+            excess = np.abs(local[:3]) - half_extents
+            distance = np.linalg.norm(np.maximum(excess, 0)) + min(excess.max(), 0)
+            assert distance == pytest.approx(radius, abs=1.1e-3)
 
 
-def test_loads_are_those_of_linear_programs(found):
+def test_loads_are_those_of_linear_programs(grasps_found):
     """With the same soft fingers, on the exact cylinder: close, since normals are sampled."""
-    one = found[1][0]
-    points = np.array([c.point for c in one.grasp.contacts.values()]) - PLACE[:3, 3]
+    grasp = grasps_found[1][0]
+    points = np.array([c.point for c in grasp.grasp.contacts.values()]) - PLACE[:3, 3]
     normals = -points * [1, 1, 0]
     if np.abs(points[:, 2]).max() > 0.0495:
         pytest.skip("a contact on the lid")
@@ -165,15 +165,15 @@ def test_loads_are_those_of_linear_programs(found):
             spin = sign * 2 / 3 * 0.5 * 0.005 * n
             columns.append(np.concatenate([n, np.cross(p, n) + spin]))
     wrenches = np.array(columns).T
-    held = []
+    max_loads = []
     for direction in np.concatenate([np.eye(3), -np.eye(3)]):
-        whole = np.column_stack([wrenches, np.concatenate([direction, np.zeros(3)])])
-        cost = np.zeros(whole.shape[1])
+        program_columns = np.column_stack([wrenches, np.concatenate([direction, np.zeros(3)])])
+        cost = np.zeros(program_columns.shape[1])
         cost[-1] = -1
-        most = [[1.0] * wrenches.shape[1] + [0.0]]
-        held.append(-linprog(cost, most, [1.0], whole, np.zeros(6)).fun)
+        force_limits = [[1.0] * wrenches.shape[1] + [0.0]]
+        max_loads.append(-linprog(cost, force_limits, [1.0], program_columns, np.zeros(6)).fun)
     # As the object gives way, some of it is lost.
-    assert 0.25 * min(held) < one.load < 1.25 * min(held) + 0.02
+    assert 0.25 * min(max_loads) < grasp.load < 1.25 * min(max_loads) + 0.02
 
 
 LINE = np.array([[[-0.03, 0, 0], [0.03, 0, 0], [0.01, 0, 0]]])
@@ -200,13 +200,16 @@ def test_loads_of_any_contacts_are_those_of_linear_programs(points, normals, off
         facing = -at + 0.01 * rng.normal(size=at.shape) if isinstance(facing, str) else facing
         facing = facing / np.linalg.norm(facing, axis=-1, keepdims=True)
         wrenches = friction_wrenches(at, facing, 0.5, np.zeros(3), 0.05)
-        found = loads(wrenches)
-        for own, row in zip(wrenches, found, strict=True):
-            cost, most = np.append(np.zeros(own.shape[1]), -1.0), np.ones((1, own.shape[1] + 1))
-            most[0, -1] = 0.0
+        grasps_found = loads(wrenches)
+        for contact_wrenches, row in zip(wrenches, grasps_found, strict=True):
+            cost, force_limits = (
+                np.append(np.zeros(contact_wrenches.shape[1]), -1.0),
+                np.ones((1, contact_wrenches.shape[1] + 1)),
+            )
+            force_limits[0, -1] = 0.0
             for direction, load in zip(DIRECTIONS, row, strict=True):
-                whole = np.column_stack([own, direction])
-                solved = linprog(cost, most, [1.0], whole, np.zeros(6), options=EXACTLY)
+                columns = np.column_stack([contact_wrenches, direction])
+                solved = linprog(cost, force_limits, [1.0], columns, np.zeros(6), options=EXACTLY)
                 assert abs(-solved.fun - load) < 2 * off
 
 
@@ -216,106 +219,122 @@ EXACTLY = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 
 @pytest.mark.parametrize("radius", [0.0, 0.012])
 def test_squeezed_between_two_balls_an_object_turns_the_easier_the_harder_it_is_pressed(radius):
     """Two springs on a line: 2 k R^2 against turning, less 2 F (R - radius)."""
-    k, half, force = 400.0, 0.04, 6.0
+    k, half_width, force = 400.0, 0.04, 6.0
     normals = np.array([[[1.0, 0, 0], [-1.0, 0, 0]]])
     jacobians = np.eye(6).reshape(1, 2, 3, 6)
     rolled = radius or COMPLIANCE.plane_radius
-    turning = 2 * k * half**2 - 2 * force * (half - rolled)
-    found = stiffnesses(
-        -half * normals, normals, force * normals, np.full((1, 2), radius), jacobians,
+    turning = 2 * k * half_width**2 - 2 * force * (half_width - rolled)
+    grasps_found = stiffnesses(
+        -half_width * normals, normals, force * normals, np.full((1, 2), radius), jacobians,
         np.full(6, k), mu=10.0,
     )  # fmt: skip
-    assert found[0] == pytest.approx(
+    assert grasps_found[0] == pytest.approx(
         turning * (COMPLIANCE.halving_rotation / COMPLIANCE.halving_displacement) ** 2, rel=0.03
     )
     assert stiffnesses(
-        -half * normals, normals, 10 * force * normals, np.full((1, 2), radius), jacobians,
+        -half_width * normals, normals, 10 * force * normals, np.full((1, 2), radius), jacobians,
         np.full(6, k), mu=10.0,
     )[0] < 0  # fmt: skip
 
 
-def test_grasps_differ_and_are_ranked(found):
-    solver, grasps = found
-    assert [one.score for one in grasps] == sorted((one.score for one in grasps), reverse=True)
-    poses = [solver.robot.palm(one.q) for one in grasps]
-    tips = [solver.robot.contacts(one.q)[0] for one in grasps]
+def test_grasps_differ_and_are_ranked(grasps_found):
+    solver, grasps = grasps_found
+    assert [grasp.score for grasp in grasps] == sorted(
+        (grasp.score for grasp in grasps), reverse=True
+    )
+    poses = [solver.robot.palm(grasp.q) for grasp in grasps]
+    tips = [solver.robot.contacts(grasp.q)[0] for grasp in grasps]
     for i in range(len(grasps)):
         for j in range(i):
-            turned = np.arccos(
+            angle = np.arccos(
                 np.clip((np.trace(poses[i][:3, :3].T @ poses[j][:3, :3]) - 1) / 2, -1, 1)
             )
-            apart = np.abs(poses[i][:3, 3] - poses[j][:3, 3]).max(), np.abs(tips[i] - tips[j]).max()
-            assert turned > 0.25 or max(apart) > 0.005
+            separations = (
+                np.abs(poses[i][:3, 3] - poses[j][:3, 3]).max(),
+                np.abs(tips[i] - tips[j]).max(),
+            )
+            assert angle > 0.25 or max(separations) > 0.005
 
 
 @pytest.mark.slow
 def test_a_gripper_comes_from_any_side_about_the_line_between_its_pads(surface):
     solver = solver_of("panda+panda_hand")
     sectors = set()
-    for one in solver.grasps_of(surface, PLACE, limit=60, among=60):
-        points = [contact.point for contact in one.grasp.contacts.values()]
+    for grasp in solver.grasps_of(surface, PLACE, limit=60, among=60):
+        points = [contact.point for contact in grasp.grasp.contacts.values()]
         x = np.cross(points[1] - points[0], [0.0, 0.0, 1.0])  # level, across the line
         if np.linalg.norm(x) > 0.5 * np.linalg.norm(points[1] - points[0]):
-            way = solver.robot.palm(one.q)[:3, 2]
-            sectors.add(int(np.degrees(np.arctan2(-way[2], way @ x / np.linalg.norm(x)))) // 15)
+            approach_axis = solver.robot.palm(grasp.q)[:3, 2]
+            sectors.add(
+                int(
+                    np.degrees(np.arctan2(-approach_axis[2], approach_axis @ x / np.linalg.norm(x)))
+                )
+                // 15
+            )
     assert len(sectors) >= 8
 
 
-def test_open_before_and_squeezing_after(found):
-    solver, grasps = found
-    opened = [one for one in grasps if one.pregrasp is not None]
+def test_open_before_and_squeezing_after(grasps_found):
+    solver, grasps = grasps_found
+    opened = [grasp for grasp in grasps if grasp.pregrasp is not None]
     assert opened
-    for one in opened:
-        assert one.grasp.squeeze is not None
-        palm = solver.robot.palm(one.q)
-        assert np.linalg.norm(one.pregrasp.palm[:3, 3] - palm[:3, 3]) == pytest.approx(0.06)
+    for grasp in opened:
+        assert grasp.grasp.squeeze is not None
+        palm = solver.robot.palm(grasp.q)
+        assert np.linalg.norm(grasp.pregrasp.palm[:3, 3] - palm[:3, 3]) == pytest.approx(0.06)
 
 
 @pytest.mark.slow
-def test_there_is_a_way_to_most_grasps_and_up_from_there(found):
-    solver, grasps = found
-    ways = [solver.approach(one) for one in grasps]
-    assert sum(way.success for way in ways) >= 0.75 * len(ways)
-    one, way = next((one, way) for one in grasps if (way := solver.reach(one, lift=0.08)).success)
-    part = way.motion.notes["part"]
+def test_there_is_a_way_to_most_grasps_and_up_from_there(grasps_found):
+    solver, grasps = grasps_found
+    motions = [solver.approach(grasp) for grasp in grasps]
+    assert sum(reach_motion.success for reach_motion in motions) >= 0.75 * len(motions)
+    grasp, reach_motion = next(
+        (grasp, reach_motion)
+        for grasp in grasps
+        if (reach_motion := solver.reach(grasp, lift=0.08)).success
+    )
+    part = reach_motion.motion.notes["part"]
     assert set(part) == {"going", "coming", "closing", "lifting"}
-    np.testing.assert_allclose(way.motion.q[part == "closing"][-1], one.q, atol=1e-6)
-    up = solver.robot.palm(way.motion.q[-1]) - solver.robot.palm(one.q)
+    np.testing.assert_allclose(reach_motion.motion.q[part == "closing"][-1], grasp.q, atol=1e-6)
+    up = solver.robot.palm(reach_motion.motion.q[-1]) - solver.robot.palm(grasp.q)
     np.testing.assert_allclose(up[:3, 3], [0, 0, 0.08], atol=3e-3)
 
 
 @pytest.mark.slow
-def test_what_is_lifted_is_placed_elsewhere(found):
-    solver, grasps = found
+def test_what_is_lifted_is_placed_elsewhere(grasps_found):
+    solver, grasps = grasps_found
     robot, to = solver.robot, PLACE.copy()
     to[:3, 3] = [0.45, -0.15, 0.055]
-    ways = ((one, solver.reach(one, lift=0.1)) for one in grasps)
-    one, up = next((one, way) for one, way in ways if way.success)
-    down = solver.place(one, to, up.motion.q[-1])
+    reached_grasps = ((grasp, solver.reach(grasp, lift=0.1)) for grasp in grasps)
+    grasp, up = next(
+        (grasp, reach_motion) for grasp, reach_motion in reached_grasps if reach_motion.success
+    )
+    down = solver.place(grasp, to, up.motion.q[-1])
     assert down.success, down.reason
     motion, part = down.motion, down.motion.notes["part"]
     assert list(dict.fromkeys(part.tolist())) == ["carrying", "lowering", "opening", "leaving"]
     np.testing.assert_array_equal(motion.q[0], up.motion.q[-1])
     # The object is held as it was, and stands where it was to be.
-    in_palm = np.linalg.inv(robot.palm(one.q)) @ PLACE
-    carried = robot.palm(motion.q[(part == "carrying") | (part == "lowering")]) @ in_palm
-    np.testing.assert_allclose(carried[-1], to, atol=3e-3)
-    assert carried[:, 2, 3].min() > PLACE[2, 3] - 3e-3
-    motors = [robot.actuators.index(name) for name in one.grasp.posture]
+    in_palm = np.linalg.inv(robot.palm(grasp.q)) @ PLACE
+    carried_poses = robot.palm(motion.q[(part == "carrying") | (part == "lowering")]) @ in_palm
+    np.testing.assert_allclose(carried_poses[-1], to, atol=3e-3)
+    assert carried_poses[:, 2, 3].min() > PLACE[2, 3] - 3e-3
+    motors = [robot.actuators.index(name) for name in grasp.grasp.posture]
     np.testing.assert_allclose(
         motion.q[part == "carrying"][:, motors],
-        np.tile(one.q[motors], ((part == "carrying").sum(), 1)),
+        np.tile(grasp.q[motors], ((part == "carrying").sum(), 1)),
         atol=2e-3,
     )
     tips = robot.contacts(motion.q[-1])[0] - robot.contacts(down.q)[0]
     assert np.linalg.norm(tips, axis=1).min() > 0.05
 
 
-def test_forces_leave_the_object_at_rest_within_friction(found):
-    grasps = found[1]
-    for one in grasps:
-        contacts = one.grasp.contacts
-        forces = np.array([one.forces[name] for name in contacts])
+def test_forces_leave_the_object_at_rest_within_friction(grasps_found):
+    grasps = grasps_found[1]
+    for grasp in grasps:
+        contacts = grasp.grasp.contacts
+        forces = np.array([grasp.forces[name] for name in contacts])
         points = np.array([contact.point for contact in contacts.values()])
         # The can's exact normals, on its side or on a lid.
         local = points - PLACE[:3, 3]
@@ -332,76 +351,84 @@ def test_forces_leave_the_object_at_rest_within_friction(found):
         assert (slid <= grasps.mu * pressed + 0.03).all()  # normals of samples are of flat facets
 
 
-def test_motors_squeeze_as_equal_springs_do(found):
+def test_motors_squeeze_as_equal_springs_do(grasps_found):
     """A squeeze moves motors in proportion to the torques of the forces, by virtual work."""
-    grasps = found[1]
-    robot = found[0].robot
-    for one in grasps[:3]:
-        posture = one.grasp.squeeze.posture
+    grasps = grasps_found[1]
+    robot = grasps_found[0].robot
+    for grasp in grasps[:3]:
+        posture = grasp.grasp.squeeze.posture
         columns = [robot.actuators.index(name) for name in posture]
-        moved = np.array(list(posture.values())) - one.q[columns]
-        torques, here, pressed = [], robot.contact_frames(one.q), []
-        for name, force in one.forces.items():
-            i, point = robot.fingers.index(name), one.grasp.contacts[name].point
-            pressed.append((i, np.linalg.inv(here[i]) @ np.append(point, 1), force))
+        motor_steps = np.array(list(posture.values())) - grasp.q[columns]
+        torques, frames, pressed = [], robot.contact_frames(grasp.q), []
+        for name, force in grasp.forces.items():
+            i, point = robot.fingers.index(name), grasp.grasp.contacts[name].point
+            pressed.append((i, np.linalg.inv(frames[i]) @ np.append(point, 1), force))
         for column in columns:
-            step = np.zeros(len(one.q))
+            step = np.zeros(len(grasp.q))
             step[column] = 1e-6
-            slope = (robot.contact_frames(one.q + step) - robot.contact_frames(one.q - step)) / 2e-6
+            slope = (
+                robot.contact_frames(grasp.q + step) - robot.contact_frames(grasp.q - step)
+            ) / 2e-6
             torques.append(sum((slope[i] @ at)[:3] @ f for i, at, f in pressed))
-        inside = (np.array(list(posture.values())) > robot.lower[columns] + 1e-6) & (
+        is_within_limits = (np.array(list(posture.values())) > robot.lower[columns] + 1e-6) & (
             np.array(list(posture.values())) < robot.upper[columns] - 1e-6
         )
-        ratio = moved[inside] @ np.array(torques)[inside] / (np.array(torques)[inside] ** 2).sum()
+        ratio = (
+            motor_steps[is_within_limits]
+            @ np.array(torques)[is_within_limits]
+            / (np.array(torques)[is_within_limits] ** 2).sum()
+        )
         assert ratio > 0
-        np.testing.assert_allclose(moved[inside], ratio * np.array(torques)[inside], atol=1e-6)
+        np.testing.assert_allclose(
+            motor_steps[is_within_limits], ratio * np.array(torques)[is_within_limits], atol=1e-6
+        )
 
 
-def test_what_is_where_it_should_be_is_closed_on(found):
-    grasps = found[1]
+def test_what_is_where_it_should_be_is_closed_on(grasps_found):
+    grasps = grasps_found[1]
     np.testing.assert_array_equal(grasps.robustness(position=0.0, angle=0.0, samples=1), 1.0)
 
 
-def test_the_farther_off_the_fewer(found):
-    grasps = found[1]
-    near, far, beyond = (
+def test_the_farther_off_the_fewer(grasps_found):
+    grasps = grasps_found[1]
+    small_noise, large_noise, huge_noise = (
         grasps.robustness(position=position, samples=24).mean() for position in (0.005, 0.02, 0.2)
     )
-    assert near >= far
-    assert far > beyond
-    assert beyond == 0.0
-    again = grasps.robustness(position=0.005, samples=24)
-    np.testing.assert_array_equal(again, grasps.robustness(position=0.005, samples=24))
+    assert small_noise >= large_noise
+    assert large_noise > huge_noise
+    assert huge_noise == 0.0
+    repeated = grasps.robustness(position=0.005, samples=24)
+    np.testing.assert_array_equal(repeated, grasps.robustness(position=0.005, samples=24))
 
 
-def test_bad_noise_is_refused(found):
-    grasps = found[1]
+def test_bad_noise_is_refused(grasps_found):
+    grasps = grasps_found[1]
     with pytest.raises(errors.InputError, match="robustness: position: found -1"):
         grasps.robustness(position=-1)
 
 
-def test_seeds_decide_and_jobs_do_not(found, surface):
-    solver, grasps = found
-    again = solver.grasps_of(surface, PLACE, limit=12, among=12, seed=1, jobs=2)
-    assert all(np.array_equal(a.q, b.q) for a, b in zip(grasps, again, strict=True))
-    other = solver.grasps_of(surface, PLACE, limit=12, among=12, seed=2)
-    assert not all(np.array_equal(a.q, b.q) for a, b in zip(grasps, other, strict=True))
+def test_seeds_decide_and_jobs_do_not(grasps_found, surface):
+    solver, grasps = grasps_found
+    parallel_grasps = solver.grasps_of(surface, PLACE, limit=12, among=12, seed=1, jobs=2)
+    assert all(np.array_equal(a.q, b.q) for a, b in zip(grasps, parallel_grasps, strict=True))
+    other_seed = solver.grasps_of(surface, PLACE, limit=12, among=12, seed=2)
+    assert not all(np.array_equal(a.q, b.q) for a, b in zip(grasps, other_seed, strict=True))
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_without_a_compiler_it_is_refused(found, surface, monkeypatch):
+def test_without_a_compiler_it_is_refused(grasps_found, surface, monkeypatch):
     monkeypatch.setenv("CC", "none")
     with pytest.raises(errors.UnsupportedError, match=r"grasps_of: .*compiler"):
-        found[0].grasps_of(surface, PLACE, limit=12, among=12)
+        grasps_found[0].grasps_of(surface, PLACE, limit=12, among=12)
 
 
 @pytest.mark.slow
 def test_what_has_to_be_held_is_held(surface):
-    found = solver_of("panda+panda_hand").grasps_of(
+    grasps_found = solver_of("panda+panda_hand").grasps_of(
         surface, PLACE, limit=5, among=5, hold=(0.1, 18.0)
     )
-    assert len(found)
-    assert all(one.load * 18.0 >= 0.1 * 9.8 for one in found)
+    assert len(grasps_found)
+    assert all(grasp.load * 18.0 >= 0.1 * 9.8 for grasp in grasps_found)
 
 
 @pytest.mark.slow
@@ -409,54 +436,58 @@ def test_torques_of_motors_limit_the_squeeze(surface):
     """The one that is used most has all that it can, by differences of its fingertips' places."""
     solver = solver_of("panda+leap")
     robot = solver.robot
-    asked = {"limit": 5, "among": 5, "hold": (0.15, 1000.0)}
-    for one in solver.grasps_of(surface, PLACE, **asked):
-        here, torques = robot.contact_frames(one.q), np.zeros(len(one.q))
-        for name, force in one.forces.items():
+    options = {"limit": 5, "among": 5, "hold": (0.15, 1000.0)}
+    for grasp in solver.grasps_of(surface, PLACE, **options):
+        frames, torques = robot.contact_frames(grasp.q), np.zeros(len(grasp.q))
+        for name, force in grasp.forces.items():
             i = robot.fingers.index(name)
-            on_link = np.linalg.inv(here[i]) @ [*one.grasp.contacts[name].point, 1.0]
-            for motor, step in enumerate(1e-6 * np.eye(len(one.q))):
-                ends = [(robot.contact_frames(q)[i] @ on_link)[:3] for q in (one.q + step, one.q)]
+            on_link = np.linalg.inv(frames[i]) @ [*grasp.grasp.contacts[name].point, 1.0]
+            for motor, step in enumerate(1e-6 * np.eye(len(grasp.q))):
+                ends = [
+                    (robot.contact_frames(q)[i] @ on_link)[:3] for q in (grasp.q + step, grasp.q)
+                ]
                 torques[motor] += (ends[0] - ends[1]) @ force / 1e-6
         hand = torques[list(robot.description.hand_actuators)]
-        assert np.abs(hand).max() * one.most_squeeze == pytest.approx(0.95, rel=1e-3)
-        assert one.load * one.most_squeeze >= 0.15 * 9.8
+        assert np.abs(hand).max() * grasp.most_squeeze == pytest.approx(0.95, rel=1e-3)
+        assert grasp.load * grasp.most_squeeze >= 0.15 * 9.8
     unknown = solver_of("panda+panda_hand").grasps_of(surface, PLACE, limit=1, among=1)
     assert unknown[0].most_squeeze == np.inf
 
 
-def test_the_best_of_many_are_given(found, surface):
-    solver, few = found
-    many = solver.grasps_of(surface, PLACE, limit=100, seed=1, among=1)
+def test_the_best_of_many_are_given(grasps_found, surface):
+    solver, few = grasps_found
+    all_grasps = solver.grasps_of(surface, PLACE, limit=100, seed=1, among=1)
     best = solver.grasps_of(surface, PLACE, limit=12, seed=1, among=100)
-    assert [one.load for one in best] == [one.load for one in many[:12]]
-    assert np.mean([one.load for one in best]) > np.mean([one.load for one in few])
+    assert [grasp.load for grasp in best] == [grasp.load for grasp in all_grasps[:12]]
+    assert np.mean([grasp.load for grasp in best]) > np.mean([grasp.load for grasp in few])
 
 
 def test_a_function_may_rank(surface):
-    found = solver_of("panda+panda_hand").grasps_of(
+    grasps_found = solver_of("panda+panda_hand").grasps_of(
         surface, PLACE, limit=5, among=20, prefer=lambda robot, q: robot.palm(q)[:, 2, 3]
     )
-    assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
+    assert [grasp.score for grasp in grasps_found] == sorted(
+        (grasp.score for grasp in grasps_found), reverse=True
+    )
 
 
 def test_what_is_too_large_says_so(tmp_path):
     box = surface_of(tmp_path, trimesh.creation.box((0.5, 0.5, 0.5)))
-    found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(box, PLACE)
-    assert not len(found)
-    assert "no two patches" in found.reason
+    grasps_found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(box, PLACE)
+    assert not len(grasps_found)
+    assert "no two patches" in grasps_found.reason
 
 
 @pytest.mark.slow
 def test_the_search_ends_when_nothing_new_is_found(tmp_path):
     cube = surface_of(tmp_path, trimesh.creation.box((0.012, 0.012, 0.012)))
-    found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(cube, PLACE)
-    assert 0 < len(found) < 200
-    assert found.counts["attempts"] < 500_000  # of a million
+    grasps_found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(cube, PLACE)
+    assert 0 < len(grasps_found) < 200
+    assert grasps_found.counts["attempts"] < 500_000  # of a million
 
 
 @pytest.mark.parametrize(
-    ("asked", "expected"),
+    ("options", "expected"),
     [
         ({"fingers": 1}, "fingers: found 1, expected an integer >= 2"),
         ({"mu": 0.0}, "mu: found 0.0, expected a friction coefficient from 0.01 to 10"),
@@ -467,21 +498,21 @@ def test_the_search_ends_when_nothing_new_is_found(tmp_path):
         ({"pose": np.zeros((4, 4))}, "pose: the matrix is not a rotation"),
     ],
 )
-def test_bad_questions_are_refused(surface, asked, expected):
+def test_bad_questions_are_refused(surface, options, expected):
     with pytest.raises(errors.InputError, match=expected.replace("(", r"\(")):
-        solver_of("panda+panda_hand").grasps_of(surface, **{"pose": PLACE, **asked})
+        solver_of("panda+panda_hand").grasps_of(surface, **{"pose": PLACE, **options})
 
 
 def test_a_mesh_that_is_inside_out_is_turned_and_said(tmp_path, surface):
     mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
     mesh.invert()
-    turned = surface_of(tmp_path, mesh)
-    assert ((turned.faces * turned.points).sum(axis=1) > 0).all()
-    assert len(turned.notes) == 1
+    turned_surface = surface_of(tmp_path, mesh)
+    assert ((turned_surface.faces * turned_surface.points).sum(axis=1) > 0).all()
+    assert len(turned_surface.notes) == 1
     assert not surface.notes
-    found = solver_of("panda+panda_hand").grasps_of(turned, PLACE, limit=3, among=3)
-    assert len(found) == 3
-    assert turned.notes[0] in str(found)
+    grasps_found = solver_of("panda+panda_hand").grasps_of(turned_surface, PLACE, limit=3, among=3)
+    assert len(grasps_found) == 3
+    assert turned_surface.notes[0] in str(grasps_found)
 
 
 def test_an_open_mesh_serves_and_is_said(tmp_path):
@@ -535,8 +566,8 @@ def test_many_triangles_are_sampled(tmp_path):
 def test_millimetres_are_told(tmp_path):
     with pytest.raises(errors.InputError, match=r"scale=0\.001"):
         surface_of(tmp_path, trimesh.creation.cylinder(33, 100))
-    found = ik.load_surface(tmp_path / "mesh.stl", scale=0.001)
-    assert found.size == pytest.approx(0.137, abs=2e-3)
+    grasps_found = ik.load_surface(tmp_path / "mesh.stl", scale=0.001)
+    assert grasps_found.size == pytest.approx(0.137, abs=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -550,20 +581,20 @@ def test_what_stands_off_costs_no_grasps(tmp_path, corners):
     """A speck is no part, a label a thin one."""
     body = trimesh.creation.cylinder(0.033, 0.1, sections=64)
     both = trimesh.util.concatenate([body, trimesh.Trimesh(corners, [[0, 1, 2]])])
-    found = solver_of("panda+panda_hand").grasps_of(
+    grasps_found = solver_of("panda+panda_hand").grasps_of(
         surface_of(tmp_path, both), PLACE, limit=3, among=3
     )
-    assert len(found) == 3
+    assert len(grasps_found) == 3
 
 
 def test_what_is_out_of_reach_is_given_up(surface):
-    far = PLACE.copy()
-    far[0, 3] = 5.0
-    found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(surface, far)
-    assert not len(found)
-    assert next(stage for stage, count in found.counts.items() if not count) == "arm reaches"
-    assert "arm reaches" in found.reason
-    assert found.counts["attempts"] < 100_000
+    far_pose = PLACE.copy()
+    far_pose[0, 3] = 5.0
+    grasps_found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(surface, far_pose)
+    assert not len(grasps_found)
+    assert next(stage for stage, count in grasps_found.counts.items() if not count) == "arm reaches"
+    assert "arm reaches" in grasps_found.reason
+    assert grasps_found.counts["attempts"] < 100_000
 
 
 @pytest.mark.slow
@@ -579,11 +610,11 @@ def test_fingers_lean_on_what_they_envelop(surface, tmp_path):
     grasps = solver.grasps_of(surface, PLACE, limit=40, among=40)
     assert len(grasps) == 40
     depths = []
-    for one in grasps:
-        assert one.clearance is not None
-        assert one.clearance >= 0
-        assert solver.solve(one.grasp, q0=one.q).success
-        clear = plain.check(one.q, one.grasp)
+    for grasp in grasps:
+        assert grasp.clearance is not None
+        assert grasp.clearance >= 0
+        assert solver.solve(grasp.grasp, q0=grasp.q).success
+        clear = plain.check(grasp.q, grasp.grasp)
         assert clear is not None
         nearest = clear.pair(0)
         if not clear.free[0]:
@@ -603,8 +634,8 @@ def test_a_file_that_is_another_mesh_by_now(tmp_path):
     solver, path = solver_of("panda+panda_hand"), tmp_path / "part.stl"
     for part in (trimesh.creation.icosphere(3, 0.03), trimesh.creation.box((0.05, 0.09, 0.11))):
         part.export(path)
-        found = solver.grasps_of(ik.load_surface(path), PLACE, limit=5, among=5)
-        assert len(found) == 5
+        grasps_found = solver.grasps_of(ik.load_surface(path), PLACE, limit=5, among=5)
+        assert len(grasps_found) == 5
         fresh = solver_of("panda+panda_hand")
-        for one in found:
-            assert fresh.solve(one.grasp, q0=one.q).success
+        for grasp in grasps_found:
+            assert fresh.solve(grasp.grasp, q0=grasp.q).success

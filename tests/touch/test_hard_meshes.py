@@ -39,10 +39,10 @@ def test_double_sided_meshes_are_used_once(tmp_path, solver, order):
     }[order]
     path = saved(tmp_path, trimesh.Trimesh(mesh.vertices, both, process=False))
     surface = ik.load_surface(path)
-    drawn = trimesh.Trimesh(*surface.object.mesh(), process=False)
-    assert len(drawn.faces) == len(mesh.faces)
-    assert drawn.is_winding_consistent
-    assert drawn.volume == pytest.approx(mesh.volume)
+    drawn_mesh = trimesh.Trimesh(*surface.object.mesh(), process=False)
+    assert len(drawn_mesh.faces) == len(mesh.faces)
+    assert drawn_mesh.is_winding_consistent
+    assert drawn_mesh.volume == pytest.approx(mesh.volume)
     radial = surface.points * [1, 1, 0]
     side = np.abs(surface.points[:, 2]) < 0.049
     assert ((surface.faces * radial).sum(axis=1)[side] > 0).all()
@@ -65,14 +65,14 @@ def test_fine_meshes_need_little_memory(tmp_path, solver):
     import resource
 
     path = saved(tmp_path, trimesh.creation.icosphere(6, 0.034))
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    memory_before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     surface = ik.load_surface(path)
     assert len(surface.corners) == 81_920
-    found = solver.grasps_of(surface, PLACE, limit=5, among=5)
-    assert len(found) == 5
-    assert all(solver.solve(grasp.grasp, q0=grasp.q).success for grasp in found)
+    grasps = solver.grasps_of(surface, PLACE, limit=5, among=5)
+    assert len(grasps) == 5
+    assert all(solver.solve(grasp.grasp, q0=grasp.q).success for grasp in grasps)
     kilobyte = 1 if sys.platform == "linux" else 1 / 1024
-    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * kilobyte
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory_before) * kilobyte
     assert grown < 1.5e6  # 25 GB with a plane for each face of the hull
 
 
@@ -120,8 +120,8 @@ def test_huge_triangles_beside_a_speck_are_answered(tmp_path, solver):
         [[0.01, 0, 0], [1.5, 0.3, 0], [0.02, 1.5, 0.1], [0.02, 1.5, -0.1]], [[0, 1, 2], [0, 2, 3]]
     )
     surface = ik.load_surface(saved(tmp_path, trimesh.util.concatenate([speck, wall])))
-    found = solver.grasps_of(surface, PLACE, limit=3, among=3)
-    assert len(found) or found.reason
+    grasps = solver.grasps_of(surface, PLACE, limit=3, among=3)
+    assert len(grasps) or grasps.reason
 
 
 def test_small_objects_have_fewer_samples(tmp_path):

@@ -12,7 +12,7 @@ from casadi_ik.app import pictures as views
 from casadi_ik.app import viewer as viewing
 
 ROBOT, PLACE = "panda+panda_hand", ("0.5", "0.1", "0.051", "0", "0", "0")
-ASKED = ("grasp", "tomato_soup_can", "--robot", ROBOT, "--scene", "table", "--limit", "6")
+GRASP_COMMAND = ("grasp", "tomato_soup_can", "--robot", ROBOT, "--scene", "table", "--limit", "6")
 
 
 @pytest.fixture(scope="module")
@@ -21,18 +21,18 @@ def solver():
 
 
 @pytest.fixture(scope="module")
-def found(solver):
+def grasps(solver):
     pose = np.eye(4)
-    pose[:3, 3] = [float(one) for one in PLACE[:3]]
+    pose[:3, 3] = [float(number) for number in PLACE[:3]]
     return solver.grasps_of(ik.load_surface("tomato_soup_can"), pose, limit=6, among=6)
 
 
 @pytest.mark.opengl
-def test_a_picture_has_a_panel_for_each_of_the_best(solver, found, tmp_path):
+def test_a_picture_has_a_panel_for_each_of_the_best(solver, grasps, tmp_path):
     path = tmp_path / "best.png"
-    figure = views.draw_grasps(solver.robot, found, path, scene=solver.scene, most=4)
+    figure = views.draw_grasps(solver.robot, grasps, path, scene=solver.scene, most=4)
     assert len(figure.axes) == 4
-    assert f"load {found[0].load:.2f}" in figure.axes[0].get_title()
+    assert f"load {grasps[0].load:.2f}" in figure.axes[0].get_title()
     image = np.asarray(Image.open(path))[..., :3]
     for axes in figure.axes:  # there is something in every panel
         (panel,) = axes.images
@@ -48,12 +48,12 @@ def test_nothing_is_no_picture(solver):
 @pytest.mark.opengl
 def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys, view):
     out, picture = tmp_path / "found.npz", tmp_path / "best.png"
-    words = [*ASKED, "--object-pose", *PLACE, "--out", str(out), "--picture", str(picture)]
+    words = [*GRASP_COMMAND, "--object-pose", *PLACE, "--out", str(out), "--picture", str(picture)]
     assert main(words) == 0
-    said = capsys.readouterr().out
-    assert "6 FOUND" in said
-    assert str(out) in said
-    assert str(picture) in said
+    output = capsys.readouterr().out
+    assert "6 FOUND" in output
+    assert str(out) in output
+    assert str(picture) in output
     assert Image.open(picture).width > 1000
     page = view(str(out), "--scene", "table").page
     assert len(page.candidate_list.shown_names) == 6
@@ -67,19 +67,19 @@ def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys, view
 
 def test_none_found_says_why_and_writes_nothing(tmp_path, capsys):
     out = tmp_path / "found.npz"
-    far = ("5", "0", "0.051", "0", "0", "0")
-    assert main([*ASKED, "--object-pose", *far, "--out", str(out)]) == 1
-    said = capsys.readouterr().out
-    assert "NONE FOUND" in said
-    assert "found.npz" not in said
+    far_pose = ("5", "0", "0.051", "0", "0", "0")
+    assert main([*GRASP_COMMAND, "--object-pose", *far_pose, "--out", str(out)]) == 1
+    output = capsys.readouterr().out
+    assert "NONE FOUND" in output
+    assert "found.npz" not in output
     assert not out.exists()
 
 
-def test_a_page_filters_by_load_and_clearance(solver, found):
-    viewer = viewing.view_found(solver.robot, found, scene=solver.scene)
+def test_a_page_filters_by_load_and_clearance(solver, grasps):
+    viewer = viewing.view_found(solver.robot, grasps, scene=solver.scene)
     try:
         offered, page = viewer.page.candidate_list, viewer.page
-        clear = sorted(one.clearance for one in found)[3]
+        clear = sorted(grasp.clearance for grasp in grasps)[3]
         offered.filter(clearance=clear)
         assert len(offered.shown_names) == 3
         offered.filter(max_count=1)

@@ -24,7 +24,7 @@ pytestmark = [
 
 WINDOW = (700, 420)
 
-KNOWN = (
+KNOWN_COMPLAINTS = (
     "THREE.Clock",
     "KHR_parallel_shader_compile",
     "GPU stall",
@@ -36,8 +36,8 @@ KNOWN = (
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with Browser() as one:
-        yield one
+    with Browser() as chromium:
+        yield chromium
 
 
 def opened(browser: Browser, viewer: viewing.Viewer, painted: bool = False) -> tuple[Page, Any]:
@@ -68,42 +68,48 @@ def pixel(page: Page, client: Any, point: np.ndarray) -> np.ndarray:
         "(document.querySelector('canvas').getBoundingClientRect())"
     )
     camera = client.camera
-    seen = np.linalg.inv(pose_of(camera.position, camera.wxyz)) @ np.append(point, 1.0)
+    point_in_camera = np.linalg.inv(pose_of(camera.position, camera.wxyz)) @ np.append(point, 1.0)
     focal = box[3] / 2 / np.tan(camera.fov / 2)
-    return np.array(box[:2]) + np.array(box[2:]) / 2 + focal * seen[:2] / seen[2]
+    return (
+        np.array(box[:2]) + np.array(box[2:]) / 2 + focal * point_in_camera[:2] / point_in_camera[2]
+    )
 
 
-def drag_along(page: Page, client: Any, shown: Any, name: str, far: float) -> None:
+def drag_along(page: Page, client: Any, view: Any, name: str, distance: float) -> None:
     """Drag that arrow of what is called so that is seen longest, so far [m]."""
-    pose, size = shown.request.poses[name], shown._handles._controls[name].handle.scale
-    here = pixel(page, client, pose[:3, 3])
+    pose, size = view.request.poses[name], view._handles._controls[name].handle.scale
+    start_pixel = pixel(page, client, pose[:3, 3])
     tips = [pixel(page, client, pose[:3, 3] + size * pose[:3, i]) for i in range(3)]
-    axis = int(np.argmax([np.linalg.norm(tip - here) for tip in tips]))
-    start = here + 0.92 * (tips[axis] - here)
-    end = start + far / size * (tips[axis] - here)
+    axis = int(np.argmax([np.linalg.norm(tip - start_pixel) for tip in tips]))
+    start = start_pixel + 0.92 * (tips[axis] - start_pixel)
+    end = start + distance / size * (tips[axis] - start_pixel)
     page.drag((float(start[0]), float(start[1])), (float(end[0]), float(end[1])), steps=4)
 
 
 def complaints(page: Page) -> list[str]:
-    return [one for one in page.complaints if not any(known in one for known in KNOWN)]
+    return [
+        complaint
+        for complaint in page.complaints
+        if not any(known_text in complaint for known_text in KNOWN_COMPLAINTS)
+    ]
 
 
-def said(page: Page, of: str) -> str:
+def text_of(page: Page, of: str) -> str:
     return page.evaluate(f"document.querySelector('{of}')?.innerText ?? ''")
 
 
 def press(page: Page, label: str, of: str = "button") -> None:
     """Press what has a label, by mouse, once it stays where it is."""
-    where = (
+    rectangle = (
         f"(() => {{ const b = [...document.querySelectorAll({of!r})]"
         f".find(b => b.innerText.trim() === {label!r}); b?.scrollIntoView({{block: 'center'}});"
         " const r = b?.getBoundingClientRect();"
         " return r && r.width && [r.x + r.width / 2, r.y + r.height / 2]; })()"
     )
-    place, before = page.wait(where), None
-    while place != before:
+    place, place_before = page.wait(rectangle), None
+    while place != place_before:
         time.sleep(0.3)
-        place, before = page.wait(where), place
+        place, place_before = page.wait(rectangle), place
     page.click(*place)
 
 
@@ -112,7 +118,7 @@ def arrived(file: Path) -> None:
     end = time.monotonic() + 180
     while not file.is_file() and time.monotonic() < end:
         time.sleep(0.05)
-    assert file.is_file(), sorted(one.name for one in file.parent.iterdir())
+    assert file.is_file(), sorted(path.name for path in file.parent.iterdir())
 
 
 def test_object_and_contact_are_dragged_by_mouse_and_reached(
@@ -120,36 +126,36 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
 ) -> None:
     page, client = opened(browser, cup)
     time.sleep(1.5)  # the camera comes to rest
-    assert said(page, ".ik-status") == "SOLVED"
-    shown, robot = cup.page, cup.page.robot
+    assert text_of(page, ".ik-status") == "SOLVED"
+    view, robot = cup.page, cup.page.robot
     # The object is the first handle, and takes its contacts along.
-    place = shown.request.object_pose[:3, 3]
-    before = shown.request.grasp.contacts["thumb"].point
-    drag_along(page, client, shown, "object", 0.02)
+    place = view.request.object_pose[:3, 3]
+    point_before = view.request.grasp.contacts["thumb"].point
+    drag_along(page, client, view, "object", 0.02)
     page.wait("document.querySelector('.ik-status') !== null")
-    assert shown.work.settle(300)
-    gone = shown.request.object_pose[:3, 3] - place
-    assert 0.004 < np.linalg.norm(gone) < 0.06
-    assert np.allclose(shown.request.grasp.contacts["thumb"].point - before, gone, atol=1e-9)
-    assert shown.result.success
-    shown.select("thumb")
-    assert shown.work.settle(300)
+    assert view.work.settle(300)
+    shift = view.request.object_pose[:3, 3] - place
+    assert 0.004 < np.linalg.norm(shift) < 0.06
+    assert np.allclose(view.request.grasp.contacts["thumb"].point - point_before, shift, atol=1e-9)
+    assert view.result.success
+    view.select("thumb")
+    assert view.work.settle(300)
     time.sleep(0.5)
-    before = shown.request.grasp.contacts["thumb"].point
-    drag_along(page, client, shown, "thumb", 0.012)
+    point_before = view.request.grasp.contacts["thumb"].point
+    drag_along(page, client, view, "thumb", 0.012)
     page.wait("document.querySelector('.ik-status') !== null")
-    assert shown.work.settle(300)
-    wanted = shown.request.grasp.contacts["thumb"].point
-    assert 0.002 < np.linalg.norm(wanted - before) < 0.04
-    assert shown.result.success
-    tip = robot.contacts(shown.result.q)[0][robot.fingers.index("thumb")]
-    assert np.linalg.norm(tip - wanted) <= 5e-3
+    assert view.work.settle(300)
+    point_target = view.request.grasp.contacts["thumb"].point
+    assert 0.002 < np.linalg.norm(point_target - point_before) < 0.04
+    assert view.result.success
+    tip = robot.contacts(view.result.q)[0][robot.fingers.index("thumb")]
+    assert np.linalg.norm(tip - point_target) <= 5e-3
     # And far away: why not is on the page.
-    drag_along(page, client, shown, "thumb", 0.3)
+    drag_along(page, client, view, "thumb", 0.3)
     page.wait("(document.querySelector('.ik-why')?.innerText ?? '').includes('the contacts')")
-    assert shown.work.settle(300)
-    assert not shown.result.success
-    assert said(page, ".ik-status") == shown.result.headline
+    assert view.work.settle(300)
+    assert not view.result.success
+    assert text_of(page, ".ik-status") == view.result.headline
     assert complaints(page) == []
     page.close()
 
@@ -157,18 +163,18 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
 def test_two_browsers_see_one_drag_and_save_it(
     cup: viewing.Viewer, browser: Browser, tmp_path: Path
 ) -> None:
-    other, _ = opened(browser, cup)
+    second_page, _ = opened(browser, cup)
     page, _ = opened(browser, cup, painted=True)
-    shown = cup.page
-    before = said(other, ".ik-finger")
-    pose = shown.request.contacts["thumb"].control.copy()
+    view = cup.page
+    text_before = text_of(second_page, ".ik-finger")
+    pose = view.request.contacts["thumb"].control.copy()
     pose[:3, 3] += [0.006, 0.0, 0.01]
-    shown.drag("thumb", pose)
-    told = "document.querySelector('.ik-finger').innerText"
-    for one in (other, page):
-        one.wait(f"{told} !== {before!r}")
-    assert said(page, ".ik-finger") == said(other, ".ik-finger")
-    other.close()
+    view.drag("thumb", pose)
+    finger_text = "document.querySelector('.ik-finger').innerText"
+    for browser_page in (second_page, page):
+        browser_page.wait(f"{finger_text} !== {text_before!r}")
+    assert text_of(page, ".ik-finger") == text_of(second_page, ".ik-finger")
+    second_page.close()
     # What is saved is what is asked now, and solves by itself.
     page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     press(page, "Files", "[role=tab]")
@@ -178,7 +184,7 @@ def test_two_browsers_see_one_drag_and_save_it(
     arrived(grasp)
     arrived(picture)
     saved = ik.load_grasp(grasp)
-    assert np.allclose(saved.contacts["thumb"].point, shown.request.grasp.contacts["thumb"].point)
+    assert np.allclose(saved.contacts["thumb"].point, view.request.grasp.contacts["thumb"].point)
     assert ik.Solver(ik.load_robot(saved.robot)).solve(saved).success
     image = plt.imread(picture)
     assert image.shape[:2] == (1000, 1600)

@@ -59,9 +59,9 @@ def test_candidates_and_ranked_answers(view, robot: ik.ArmHand, tmp_path: Path) 
     entry = {"candidate": 3, "name": "", "score": 0.5, "solution": as_json(solution)}
     ranked = tmp_path / "ranked.json"
     ranked.write_text(json.dumps({"ranked": [entry]}))
-    shown = view(str(ranked)).page
-    assert shown.result.success
-    assert np.allclose(shown.result.q, solution.q)
+    page_shown = view(str(ranked)).page
+    assert page_shown.result.success
+    assert np.allclose(page_shown.result.q, solution.q)
 
 
 RANKED = (
@@ -88,9 +88,9 @@ def test_ranked_files_that_are_none(
     path = tmp_path / "ranked.json"
     path.write_text(text, encoding="latin1")
     assert main(["view", str(path)]) == 2
-    said = capsys.readouterr().err
-    assert message.lower() in said.lower()
-    assert said.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert message.lower() in error_text.lower()
+    assert error_text.count("\n") == 1
 
 
 def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None:
@@ -101,13 +101,13 @@ def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None
     page.show(10_000)
     assert page.work.settle(300)
     assert page.time_shown == page.end_time == max(map(len, page.playbacks))
-    for track, (drawn, _) in zip(page.playbacks, page._views, strict=True):
-        assert np.array_equal(drawn.q, track.q[-1])
-        assert all(one.ok for one in track.verdicts(len(track) - 1).values())
+    for track, (drawn_view, _) in zip(page.playbacks, page._views, strict=True):
+        assert np.array_equal(drawn_view.q, track.q[-1])
+        assert all(verdict.ok for verdict in track.verdicts(len(track) - 1).values())
     assert "smallest singular values" in page._charts.content
     page.jump(forward=False)
     assert page.work.settle(300)
-    assert page.time_shown in {one for track in page.playbacks for one in track.event_times}
+    assert page.time_shown in {verdict for track in page.playbacks for verdict in track.event_times}
 
 
 def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
@@ -117,8 +117,8 @@ def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     page = view(str(tmp_path / "way.mcap")).page
     page.show(1.23)
     assert page.work.settle(300)
-    ((drawn, _),) = page._views
-    assert np.allclose(drawn.q, q[24])
+    ((drawn_view, _),) = page._views
+    assert np.allclose(drawn_view.q, q[24])
     assert "1.20</b> of 2.00 s" in page._summary.content
     assert "lwr_joint_3" in page._charts.content
 
@@ -140,15 +140,15 @@ def test_bad_words_are_one_line(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["view", *words]) == 2
-    said = capsys.readouterr().err
-    assert re.search(message, said)
-    assert said.count("\n") == 1
+    error_text = capsys.readouterr().err
+    assert re.search(message, error_text)
+    assert error_text.count("\n") == 1
 
 
 def test_a_robot_and_a_solution_show_themselves(robot: ik.ArmHand) -> None:
-    shown = robot.view()
-    assert shown.page.result.success
-    shown.stop()
+    opened_viewer = robot.view()
+    assert opened_viewer.page.result.success
+    opened_viewer.stop()
     solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
     viewer = solution.view(grasp=ik.load_grasp("cup"))
     assert np.array_equal(viewer.page.result.q, solution.q)

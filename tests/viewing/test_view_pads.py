@@ -14,8 +14,8 @@ from casadi_ik.app import viewer as viewing
 
 def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description: Path) -> None:
     page = pads.page
-    before = ik.load_robot(description)
-    points, normals = before.contacts(before.home)
+    robot_before = ik.load_robot(description)
+    points, normals = robot_before.contacts(robot_before.home)
     pose = page.request.contacts["first"].control.copy()
     pose[:3, 3] += [0.001, 0.002, 0.003]
     page.drag("first", pose)
@@ -24,16 +24,16 @@ def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description:
     assert page.work.settle(300)
     assert page.message == "saved to my_hand.yaml: first, second"
     after = ik.load_robot(description)
-    moved, faced = after.contacts(after.home)
-    assert np.allclose(moved[0], points[0] + [0.001, 0.002, 0.003], atol=1e-6)
-    assert np.allclose(moved[1], points[1], atol=1e-6)
+    points_after, faced = after.contacts(after.home)
+    assert np.allclose(points_after[0], points[0] + [0.001, 0.002, 0.003], atol=1e-6)
+    assert np.allclose(points_after[1], points[1], atol=1e-6)
     assert np.allclose(faced[0], normals[0], atol=1e-6)
     assert np.allclose(faced[1], np.array([0.1, -0.9, 0.3]) / np.sqrt(0.91), atol=1e-6)
     text = description.read_text()
     assert "# corrected by hand; the guess was: where a ray meets the shape\n  first:" in text
     assert "  # corrected by hand\n  second:" in text
-    for kept in ("# Made by somebody", "# a comment that stays", "fingers:  # xyz [m]"):
-        assert kept in text
+    for text_kept in ("# Made by somebody", "# a comment that stays", "fingers:  # xyz [m]"):
+        assert text_kept in text
     assert page.changed_fingers == []
 
 
@@ -56,7 +56,7 @@ def test_a_pad_goes_onto_the_skin(pads: viewing.Viewer) -> None:
 
 
 def test_pads_that_are_not_stated_are_asked_for(tmp_path: Path) -> None:
-    other = tmp_path / "other.yaml"
-    other.write_text("name: other\nhand: barrett_bh8_280\nfingers: [thumb]\n")
+    other_file = tmp_path / "other.yaml"
+    other_file.write_text("name: other\nhand: barrett_bh8_280\nfingers: [thumb]\n")
     with pytest.raises(errors.DescriptionError, match=r"other\.yaml: fingers: expected"):
-        viewing.view_pads(other)
+        viewing.view_pads(other_file)

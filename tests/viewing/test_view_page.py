@@ -18,9 +18,9 @@ from casadi_ik.app.viewer.viser_scene import pose_of
 
 
 def shifted(pose: np.ndarray, *by: float) -> np.ndarray:
-    moved = pose.copy()
-    moved[:3, 3] += by
-    return moved
+    moved_pose = pose.copy()
+    moved_pose[:3, 3] += by
+    return moved_pose
 
 
 def test_the_page_begins_solved_and_serves_this_machine_only(cup: viewing.Viewer) -> None:
@@ -39,7 +39,7 @@ def test_the_page_begins_solved_and_serves_this_machine_only(cup: viewing.Viewer
 
 def test_a_dragged_contact_and_normal_are_reached(cup: viewing.Viewer) -> None:
     page, robot = cup.page, cup.page.robot
-    before = page.result.q
+    q_before = page.result.q
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.004, 0.008, 0.004))
     normal = page.request.grasp.contacts["thumb"].normal + np.array([0.0, 0.0, 0.12])
     page.drag_normal("thumb", normal)
@@ -47,10 +47,10 @@ def test_a_dragged_contact_and_normal_are_reached(cup: viewing.Viewer) -> None:
     assert page.result.success
     tip, faced = (values[robot.fingers.index("thumb")] for values in robot.contacts(page.result.q))
     assert faced @ normal / np.linalg.norm(normal) >= np.cos(np.deg2rad(3.0))
-    wanted = page.request.grasp.contacts["thumb"].point
-    assert np.linalg.norm(tip - wanted) <= page.request.settings.tolerance.position
+    point_target = page.request.grasp.contacts["thumb"].point
+    assert np.linalg.norm(tip - point_target) <= page.request.settings.tolerance.position
     # The nearest answer: no motor goes far for a centimetre.
-    assert np.abs(page.result.q - before).max() < 0.5
+    assert np.abs(page.result.q - q_before).max() < 0.5
 
 
 def test_links_stand_where_they_hang(cup: viewing.Viewer, rng: np.random.Generator) -> None:
@@ -58,13 +58,13 @@ def test_links_stand_where_they_hang(cup: viewing.Viewer, rng: np.random.Generat
     page, robot = cup.page, cup.page.robot
     page.drag_motors(robot.random(rng, 1)[0])
     assert page.work.settle(300)
-    drawn = {frame.name: frame for frame in page._drawn._frames}
+    frames = {frame.name: frame for frame in page._drawn._frames}
     poses: dict[str, np.ndarray] = {"/robot": np.eye(4)}
-    for name, mesh in drawn.items():
+    for name, mesh in frames.items():
         on = poses[name.rpartition("/")[0]]
         poses[name] = on @ pose_of(mesh.position, mesh.wxyz)
     links = robot.links(page.result.q)
-    assert len(drawn) == len(robot.description.links)
+    assert len(frames) == len(robot.description.links)
     for name, place in poses.items():
         if name != "/robot":
             assert np.abs(place - links[name.rpartition("/")[2]]).max() < 1e-8
@@ -80,26 +80,29 @@ def test_an_unreachable_contact_shows_why_and_what_is_nearest(cup: viewing.Viewe
     # What is drawn is the nearest configuration, and the verdict is that of what is drawn.
     points, normals = page.request.grasp.arrays(robot.fingers)
     position, _ = robot.errors(result.q, points, normals)
-    shown = [result.verdicts[finger].position_error for finger in robot.fingers]
-    assert np.allclose(position, shown)
+    errors_shown = [result.verdicts[finger].position_error for finger in robot.fingers]
+    assert np.allclose(position, errors_shown)
     assert result.reasons[0].split(":")[0] in page._panel._results.content
 
 
 def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
     cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page, drawn, draw = cup.page, [], cup.page.draw
-    monkeypatch.setattr(page, "draw", lambda result: (drawn.append(result), draw(result)))
+    page, results_drawn, draw = cup.page, [], cup.page.draw
+    monkeypatch.setattr(page, "draw", lambda result: (results_drawn.append(result), draw(result)))
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.0, 0.0, 0.05))
     assert page.work.settle(300)
-    at_once, at_rest = drawn
+    at_once, at_rest = results_drawn
     assert at_once.headline == "NOT MET"
     assert len(at_once.reasons) == 1
     assert at_once.needs_diagnosis
     # What is drawn at once is as near as what the diagnosis comes to.
-    far, nearest = (max(one.position_error for one in result.verdicts.values()) for result in drawn)
+    far_error, nearest = (
+        max(verdict.position_error for verdict in result.verdicts.values())
+        for result in results_drawn
+    )
     assert nearest > 5e-3
-    assert far <= 1.05 * nearest
+    assert far_error <= 1.05 * nearest
     # Where nothing nearer is found, the arm stays where it is when the reason comes.
     assert np.array_equal(at_rest.q, at_once.q)
     assert at_rest is page.result
@@ -135,15 +138,15 @@ def test_all_solutions_can_be_gone_through(cup: viewing.Viewer) -> None:
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.0, 0.0, 0.001))
     assert page.work.settle(300)
     assert len(page.solutions) > 1
-    shown = []
+    q_shown = []
     for number in range(len(page.solutions)):
         page.show_solution(number)
         assert page.work.settle(300)
         assert page.result.success
-        shown.append(page.result.q)
-    apart = [np.abs(a - b).max() for i, a in enumerate(shown) for b in shown[:i]]
-    assert min(apart) > 0.01
-    assert f"{len(shown)} of {len(shown)}" in page._panel._solution.content
+        q_shown.append(page.result.q)
+    differences = [np.abs(a - b).max() for i, a in enumerate(q_shown) for b in q_shown[:i]]
+    assert min(differences) > 0.01
+    assert f"{len(q_shown)} of {len(q_shown)}" in page._panel._solution.content
 
 
 def test_all_solutions_and_another_method_are_seen_at_once(cup: viewing.Viewer) -> None:
@@ -151,9 +154,9 @@ def test_all_solutions_and_another_method_are_seen_at_once(cup: viewing.Viewer) 
     page.show_ghosts(True)
     page.compare("enhanced-dls")
     assert page.work.settle(300)
-    drawn = set(scene._handle_from_node_name)
-    assert sum(name.startswith("/ghosts/") for name in drawn) == min(len(page.solutions), 10)
-    assert any(name.startswith("/beside/robot/") for name in drawn)
+    names_drawn = set(scene._handle_from_node_name)
+    assert sum(name.startswith("/ghosts/") for name in names_drawn) == min(len(page.solutions), 10)
+    assert any(name.startswith("/beside/robot/") for name in names_drawn)
     assert "enhanced-dls" in page._panel._comparison_html.content
     page.show_ghosts(False)
     page.compare("none")
@@ -178,13 +181,13 @@ def test_steps_are_taken_back_and_done_again(cup: viewing.Viewer) -> None:
 
 def test_a_dragged_object_is_grasped_all_the_way(cup: viewing.Viewer) -> None:
     page = cup.page
-    start, before = page.request.object_pose, page.request.grasp.contacts["thumb"].point
+    start, point_before = page.request.object_pose, page.request.grasp.contacts["thumb"].point
     for angle in np.linspace(0.0, 2 * np.pi, 12):
         page.drag("object", shifted(start, *(0.05 * np.cos([angle, angle - 1.6, 2 * angle]))))
         assert page.work.settle(300)
         assert page.result.success
         shift = page.request.object_pose[:3, 3] - start[:3, 3]
-        assert np.allclose(page.request.grasp.contacts["thumb"].point - before, shift)
+        assert np.allclose(page.request.grasp.contacts["thumb"].point - point_before, shift)
 
 
 def test_a_page_needs_no_server_once_it_is_written(cup: viewing.Viewer, tmp_path: Path) -> None:
@@ -204,14 +207,14 @@ def test_another_robot_grasp_and_scene_are_opened(robot: ik.ArmHand) -> None:
         ({"robot": "ar10"}, "", "table"),
         ({"scene": ""}, "", None),
     )
-    for wanted, grasp, scene in opened:
-        before = viewer.page
-        before.open(**wanted)
+    for expected_robot, grasp, scene in opened:
+        page_before = viewer.page
+        page_before.open(**expected_robot)
         end = time.monotonic() + 300
-        while viewer.page is before and time.monotonic() < end:
+        while viewer.page is page_before and time.monotonic() < end:
             time.sleep(0.02)
         page = viewer.page
-        assert page is not before
+        assert page is not page_before
         assert page.work.settle(300)
         assert page.request.name == grasp
         assert (page.request.scene and page.request.scene.name) == scene
@@ -227,8 +230,8 @@ def test_a_moved_scene_is_saved_as_it_stands(cup: viewing.Viewer, tmp_path: Path
     page.drag("table", shifted(page.request.scene.items["table"].pose, 0.1, 0.0, -0.05))
     assert page.work.settle(300)
     (tmp_path / "moved.yaml").write_text(page.request.scene.text())
-    again = ik.load_scene(tmp_path / "moved.yaml")
-    assert np.allclose(again.items["table"].pose, page.request.scene.items["table"].pose)
+    saved_scene = ik.load_scene(tmp_path / "moved.yaml")
+    assert np.allclose(saved_scene.items["table"].pose, page.request.scene.items["table"].pose)
 
 
 def test_motors_moved_by_hand_are_judged_and_not_solved(cup: viewing.Viewer) -> None:
@@ -239,7 +242,7 @@ def test_motors_moved_by_hand_are_judged_and_not_solved(cup: viewing.Viewer) -> 
     assert page.work.settle(300)
     assert np.array_equal(page.result.q, q)
     assert page.result.headline == "NOT MET"
-    assert all(one.position_error > 5e-3 for one in page.result.verdicts.values())
+    assert all(verdict.position_error > 5e-3 for verdict in page.result.verdicts.values())
 
 
 def test_settings_are_those_that_it_is_solved_with(cup: viewing.Viewer) -> None:
@@ -249,19 +252,19 @@ def test_settings_are_those_that_it_is_solved_with(cup: viewing.Viewer) -> None:
     page.change("settings", lambda a: replace(a, settings=tightly))
     assert page.work.settle(300)
     assert page.result.success
-    assert {one.tolerance for one in page.result.verdicts.values()} == {tight}
-    assert max(one.position_error for one in page.result.verdicts.values()) <= 1e-6
+    assert {verdict.tolerance for verdict in page.result.verdicts.values()} == {tight}
+    assert max(verdict.position_error for verdict in page.result.verdicts.values()) <= 1e-6
 
 
 def test_a_solver_moves_what_stands_about_it(robot: ik.ArmHand) -> None:
     solver, grasp = ik.Solver(robot, scene=ik.load_scene("table")), ik.load_grasp("cup")
     pose = shifted(solver.scene.items["table"].pose, -1.3, 0.0, 0.36)
-    moved = solver.moved("table", pose)
+    moved_solver = solver.moved("table", pose)
     fresh = ik.Solver(robot, scene=solver.scene.moved("table", pose))
-    one, other = moved.solve(grasp), fresh.solve(grasp)
-    assert np.array_equal(one.q, other.q)
-    assert one.clearance == other.clearance
-    assert one.status is ik.Status.COLLISION
+    moved_solution, fresh_solution = moved_solver.solve(grasp), fresh.solve(grasp)
+    assert np.array_equal(moved_solution.q, fresh_solution.q)
+    assert moved_solution.clearance == fresh_solution.clearance
+    assert moved_solution.status is ik.Status.COLLISION
     assert solver.solve(grasp).success
     with pytest.raises(errors.InputError, match="has no scene"):
         ik.Solver(robot).moved("table", pose)

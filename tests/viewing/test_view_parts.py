@@ -21,32 +21,37 @@ from casadi_ik.compile.cancellation import stop_if_cancelled
 from casadi_ik.files.reading import Frame, frame_matrix
 
 
-def turned(x: float, y: float, z: float, *angles: float) -> np.ndarray:
+def rotated_pose(x: float, y: float, z: float, *angles: float) -> np.ndarray:
     return frame_matrix(Frame((x, y, z), angles or (0.3, -0.2, 0.9)))
 
 
 def test_quaternions_are_those_of_rotations_of_any_angle(rng: np.random.Generator) -> None:
     axes = rng.normal(size=(200, 3))
     angles = np.concatenate([rng.uniform(-np.pi, np.pi, 196), [0.0, np.pi, -np.pi, 1e-9]])
-    half = angles[:, None] / 2
+    half_angles = angles[:, None] / 2
     wxyz = np.hstack(
-        [np.cos(half), np.sin(half) * axes / np.linalg.norm(axes, axis=1, keepdims=True)]
+        [
+            np.cos(half_angles),
+            np.sin(half_angles) * axes / np.linalg.norm(axes, axis=1, keepdims=True),
+        ]
     )
-    poses = np.array([pose_of(np.zeros(3), one) for one in wxyz])
-    again = np.array([pose_of(np.zeros(3), one) for one in quaternions(poses[:, :3, :3])])
-    assert np.allclose(again, poses, atol=1e-12)
+    poses = np.array([pose_of(np.zeros(3), quaternion) for quaternion in wxyz])
+    poses_again = np.array(
+        [pose_of(np.zeros(3), quaternion) for quaternion in quaternions(poses[:, :3, :3])]
+    )
+    assert np.allclose(poses_again, poses, atol=1e-12)
 
 
 def test_each_hand_of_a_body_has_a_camera_that_sees_it() -> None:
     robot = ik.load_robot("g1+dex3")
-    found = cameras(robot, robot.home)
-    assert list(found) == ["Robot", "Left", "Right"]
+    found_cameras = cameras(robot, robot.home)
+    assert list(found_cameras) == ["Robot", "Left", "Right"]
     for side, fingers in robot.hands.items():
-        camera = found[side.capitalize()]
+        camera = found_cameras[side.capitalize()]
         tips = robot.contacts(robot.home)[0]
-        away = np.linalg.norm(tips - camera.target, axis=1) < camera.radius
-        assert [i for i, near in enumerate(away) if near] == list(fingers)
-        assert camera.radius < 0.5 * found["Robot"].radius
+        is_in_view = np.linalg.norm(tips - camera.target, axis=1) < camera.radius
+        assert [i for i, is_near in enumerate(is_in_view) if is_near] == list(fingers)
+        assert camera.radius < 0.5 * found_cameras["Robot"].radius
 
 
 def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
@@ -61,17 +66,18 @@ def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
 
 
 @pytest.mark.parametrize(
-    "more", [{"normal": [0, 0, 1]}, {"line": [0, 0, 1]}, {"plane": [0, 0, 1]}, {"ball": [0, 0, 1]}]
+    "vectors",
+    [{"normal": [0, 0, 1]}, {"line": [0, 0, 1]}, {"plane": [0, 0, 1]}, {"ball": [0, 0, 1]}],
 )
-def test_every_kind_of_contact_is_asked_as_it_is_and_turns(robot: ik.ArmHand, more) -> None:
-    (kind,), given = more, ik.Contact([0.3, 0.1, 0.5], **more)
-    request = request_of(robot, ik.Grasp({"thumb": given}), None)
-    found = request.grasp.contacts["thumb"]
+def test_every_kind_of_contact_is_asked_as_it_is_and_turns(robot: ik.ArmHand, vectors) -> None:
+    (kind,), contact = vectors, ik.Contact([0.3, 0.1, 0.5], **vectors)
+    request = request_of(robot, ik.Grasp({"thumb": contact}), None)
+    contact_read = request.grasp.contacts["thumb"]
     for name in ("point", "normal", "line", "plane", "ball"):
-        one, other = getattr(given, name), getattr(found, name)
-        assert (one is None) == (other is None)
-        assert one is None or np.allclose(one, other, atol=1e-12)
-    turn = turned(0.0, 0.0, 0.0)
+        vector, vector_read = getattr(contact, name), getattr(contact_read, name)
+        assert (vector is None) == (vector_read is None)
+        assert vector is None or np.allclose(vector, vector_read, atol=1e-12)
+    turn = rotated_pose(0.0, 0.0, 0.0)
     turned_contact = request.with_pose("thumb", turn @ request.poses["thumb"]).grasp.contacts[
         "thumb"
     ]
@@ -88,19 +94,23 @@ def test_what_is_saved_is_read_back(robot: ik.ArmHand, tmp_path: Path) -> None:
         "finger_2": special,
         "finger_3": ik.Contact(direction=[0.0, 1.0, 0.5]),
     }
-    grasp = ik.Grasp(contacts, "kuka_lwr_barrett", "mine", "cup", turned(0.1, 0.2, 0.3))
+    grasp = ik.Grasp(contacts, "kuka_lwr_barrett", "mine", "cup", rotated_pose(0.1, 0.2, 0.3))
     path = tmp_path / "mine.yaml"
     path.write_text(grasp_text(grasp, "a comment"), encoding="utf-8")
-    again = ik.load_grasp(path)
-    assert (again.robot, again.object, again.name) == (grasp.robot, grasp.object, "mine")
-    assert np.allclose(again.object_pose, grasp.object_pose, atol=1e-12)
+    saved_grasp = ik.load_grasp(path)
+    assert (saved_grasp.robot, saved_grasp.object, saved_grasp.name) == (
+        grasp.robot,
+        grasp.object,
+        "mine",
+    )
+    assert np.allclose(saved_grasp.object_pose, grasp.object_pose, atol=1e-12)
     for finger, contact in grasp.contacts.items():
-        found = again.contacts[finger]
+        contact_read = saved_grasp.contacts[finger]
         for name in ("point", "normal", "tangent", "line", "plane"):
-            one, other = getattr(contact, name), getattr(found, name)
-            assert (one is None) == (other is None)
-            assert one is None or np.allclose(one, other, atol=1e-15, equal_nan=True)
-        assert found.tolerance == contact.tolerance
+            vector, vector_read = getattr(contact, name), getattr(contact_read, name)
+            assert (vector is None) == (vector_read is None)
+            assert vector is None or np.allclose(vector, vector_read, atol=1e-15, equal_nan=True)
+        assert contact_read.tolerance == contact.tolerance
 
 
 def test_only_the_newest_change_of_a_key_is_done() -> None:
@@ -169,8 +179,8 @@ def test_bodies_are_closed_and_wind_outwards() -> None:
             "can": {"kind": "object", "object": "mustard_bottle"},
         }
     )
-    drawn = [one for item in scene.items.values() for one in item_drawables(item)]
-    surfaces = [one.surface for one in drawn]
+    drawables = [drawable for item in scene.items.values() for drawable in item_drawables(item)]
+    surfaces = [drawable.surface for drawable in drawables]
     for body in [*surfaces, arrow(np.zeros(3), np.array([1.0, 0, 0]), 0.05, 0.005).surface]:
         for surface in (body, split_sharp_edges(body)):
             a, b, c = (surface.points[surface.triangles[:, i]] for i in range(3))
@@ -189,8 +199,8 @@ def test_nothing_is_written_where_pads_are_not_stated(description: Path) -> None
 
 
 def test_links_look_as_their_files_show_them(description: Path) -> None:
-    drawn = {one.name: one.surface for one in visual_bodies(ik.load_robot(description))}
-    assert {"pad first", "pad second"} <= set(drawn)
+    surfaces = {body.name: body.surface for body in visual_bodies(ik.load_robot(description))}
+    assert {"pad first", "pad second"} <= set(surfaces)
     for link in ("first_2", "second_2"):
-        assert np.allclose(np.ptp(drawn[link].points, axis=0), [0.02, 0.016, 0.04])
-        assert np.allclose(drawn[link].points.mean(axis=0), [0, 0, 0.02])
+        assert np.allclose(np.ptp(surfaces[link].points, axis=0), [0.02, 0.016, 0.04])
+        assert np.allclose(surfaces[link].points.mean(axis=0), [0, 0, 0.02])

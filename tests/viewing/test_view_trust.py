@@ -42,19 +42,19 @@ def opened(
     url: str, host: str = "", origin: str | None = None, version: str | None = VERSION
 ) -> Connection:
     """A websocket to a page's address, as a browser opens it that was led there by a name."""
-    there = urlsplit(url)
-    assert there.hostname is not None
-    assert there.port is not None
-    named = f"ws://{host or there.netloc}{there.path.rstrip('/')}"
-    way = socket.create_connection((there.hostname, there.port))
+    address = urlsplit(url)
+    assert address.hostname is not None
+    assert address.port is not None
+    named = f"ws://{host or address.netloc}{address.path.rstrip('/')}"
+    connection = socket.create_connection((address.hostname, address.port))
     spoken = None if version is None else [Subprotocol(version)]
     whose = None if origin is None else Origin(origin)
-    return connect(named, sock=way, origin=whose, subprotocols=spoken, max_size=None)
+    return connect(named, sock=connection, origin=whose, subprotocols=spoken, max_size=None)
 
 
 def send(page: Connection, *messages: Any) -> None:
-    for one in messages:
-        page.send(one if isinstance(one, bytes | str) else msgspec.msgpack.encode(one))
+    for message in messages:
+        page.send(message if isinstance(message, bytes | str) else msgspec.msgpack.encode(message))
 
 
 def greeted(page: Connection) -> bool:
@@ -75,12 +75,12 @@ def fetch_page(url: str, **headers: str) -> tuple[int, bytes]:
 def dragged(viewer: viewing.Viewer) -> dict[str, Any]:
     """What a browser sends when the first contact is moved."""
     control = viewer.page._handles._controls[viewer.page.robot.fingers[0]].handle
-    moved = control.position + np.array([0.0, 0.002, 0.0])
+    position = control.position + np.array([0.0, 0.002, 0.0])
     return {
         "type": "TransformControlsUpdateMessage",
         "name": control.name,
         "wxyz": [1, 0, 0, 0],
-        "position": moved.tolist(),
+        "position": position.tolist(),
     }
 
 
@@ -110,34 +110,34 @@ def test_a_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str |
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
 def test_the_page_itself_is_answered(cup: viewing.Viewer, name: str) -> None:
     """Also through a tunnel: the port may be another one."""
-    there = urlsplit(cup.url)
+    address = urlsplit(cup.url)
     assert b"<html" in fetch_page(cup.url, Host=f"{name}:9999")[1].lower()
-    for host in (f"{name}:{there.port}", f"{name}:9999"):
+    for host in (f"{name}:{address.port}", f"{name}:9999"):
         with opened(cup.url, host, f"http://{host}") as page:
             assert greeted(page)
 
 
 def test_where_can_be_written_the_address_has_a_token(pads, description: Path) -> None:
-    there, before = urlsplit(pads.url), description.read_text()
-    assert len(there.path) > 20
+    address, text_before = urlsplit(pads.url), description.read_text()
+    assert len(address.path) > 20
     assert fetch_page(pads.url)[0] == 200
-    for path in ("", "/", "/x", there.path[:-2]):
-        bare = f"http://{there.netloc}{path}"
+    for path in ("", "/", "/x", address.path[:-2]):
+        bare = f"http://{address.netloc}{path}"
         assert fetch_page(bare)[0] == 403
         with pytest.raises(InvalidStatus):
             opened(bare)
-    with opened(pads.url, origin=f"http://{there.netloc}") as page:
+    with opened(pads.url, origin=f"http://{address.netloc}") as page:
         assert greeted(page)
         send(page, dragged(pads), pressed(pads.page._save_button))
         while not pads.page.message:
             page.recv(120)
     assert pads.page.work.settle(300)
     assert pads.page.message.startswith("saved to")
-    assert description.read_text() != before
+    assert description.read_text() != text_before
 
 
 def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
-    before, viewer = description.read_text(), viewing.view_pads(description, host="0.0.0.0")
+    text_before, viewer = description.read_text(), viewing.view_pads(description, host="0.0.0.0")
     assert viewer.page._save_button.disabled
     with opened(viewer.url) as page:
         assert greeted(page)
@@ -146,7 +146,7 @@ def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
         send(page, pressed(viewer.page._save_button), CAMERA | {"fov": 0.5})
         page.ping().wait(120)
     assert viewer.page.work.settle(300)
-    assert description.read_text() == before
+    assert description.read_text() == text_before
     with opened(viewer.url, f"192.0.2.1:{urlsplit(viewer.url).port}") as page:  # seen from afar
         assert greeted(page)
     with pytest.raises(InvalidStatus):
@@ -155,10 +155,10 @@ def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
 
 
 def test_nothing_is_shared(cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[Any] = []
+    servers: list[Any] = []
 
     def tunnel(*words: Any) -> None:
-        made.append(words)
+        servers.append(words)
         raise RuntimeError
 
     monkeypatch.setattr("viser._viser.ViserTunnel", tunnel)
@@ -167,7 +167,7 @@ def test_nothing_is_shared(cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch)
         send(page, {"type": "ShareUrlRequest"}, CAMERA, {"type": "ShareUrlDisconnect"})
         page.ping().wait(120)
         assert cup._server.request_share_url() is None
-    assert made == []
+    assert servers == []
 
 
 def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path: Path) -> None:
@@ -223,11 +223,11 @@ def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path:
     for version in ("viser-v0", None):
         with opened(url, version=version) as page, pytest.raises(ConnectionClosed):
             page.recv(120)
-    for one in broken:
+    for message in broken:
         with opened(url) as page:
             assert greeted(page)
             with suppress(ConnectionClosed):
-                send(page, one)
+                send(page, message)
                 page.ping().wait(120)
     good = drag | {"wxyz": [1, 0, 0, 0], "position": [-0.83, 0.15, 0.41]}
     with opened(url) as page:

@@ -95,7 +95,11 @@ def test_the_strip_of_events_has_a_row_per_kind_and_jacobian(log) -> None:
     numbers = np.arange(4)
     part = logs.MethodRows("made-up", rows, numbers * 0, numbers * 10, labels, {})
     figure = views.draw_convergence(log.iterations(), events=logs.Table("event", (part,)), dpi=40)
-    (axes,) = [one for one in figure.axes if one.get_title(loc="left") == "events"]
+    (axes,) = [
+        candidate_axes
+        for candidate_axes in figure.axes
+        if candidate_axes.get_title(loc="left") == "events"
+    ]
     named = [label.get_text() for label in axes.get_yticklabels()]
     begun = [bars.get_paths()[0].vertices[:, 0].min() for bars in axes.collections]
     assert dict(zip(named, begun, strict=True)) == {
@@ -119,28 +123,30 @@ def long_log(robot, tmp_path_factory) -> ik.logs.Log:
     return ik.logs.open(path)
 
 
-def drawn(long_log: ik.logs.Log, **options):
+def draw_log(long_log: ik.logs.Log, **options):
     return views.draw_convergence(long_log.iterations(), events=long_log.events(), **options)
 
 
 def test_only_the_span_is_drawn_and_scaled(long_log):
-    whole, part = drawn(long_log).axes[0], drawn(long_log, span=(4, 10)).axes[0]
+    full_axes, part = draw_log(long_log).axes[0], draw_log(long_log, span=(4, 10)).axes[0]
     assert part.get_xlim() == (2.5, 9.5)
-    assert whole.get_xlim()[1] > 9.5
-    seen = part.lines[0].get_ydata()
-    assert np.isfinite(seen[3:10]).all()
-    assert np.isnan(np.delete(seen, slice(3, 10))).all()
+    assert full_axes.get_xlim()[1] > 9.5
+    shown_values = part.lines[0].get_ydata()
+    assert np.isfinite(shown_values[3:10]).all()
+    assert np.isnan(np.delete(shown_values, slice(3, 10))).all()
 
 
 @pytest.mark.parametrize("span", [(0, 3), (5, 4), (1, 10_000)])
 def test_a_span_that_is_not_there_is_refused(long_log, span):
     with pytest.raises(errors.InputError, match="span: found"):
-        drawn(long_log, span=span)
+        draw_log(long_log, span=span)
 
 
 def test_a_threshold_that_was_passed_is_a_line_with_a_name(long_log):
     axes = next(
-        axes for axes in drawn(long_log).axes if axes.get_title("left") == "smallest singular value"
+        axes
+        for axes in draw_log(long_log).axes
+        if axes.get_title("left") == "smallest singular value"
     )
     named = {line.get_label(): line for line in axes.lines}
     (event,) = [

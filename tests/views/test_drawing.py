@@ -29,7 +29,7 @@ pytestmark = pytest.mark.opengl
 
 AXIS = np.array([0.3, -0.5, 0.8])
 ORIGIN = np.zeros(3)
-ASIDE = np.array([1.0, 0, 0])
+BESIDE = np.array([1.0, 0, 0])
 
 SHAPES = {
     "capsule": (
@@ -37,8 +37,8 @@ SHAPES = {
         np.pi * 1e-2 * np.linalg.norm(AXIS) + 4 / 3 * np.pi * 1e-3,
     ),
     "ball": (ball(0.1), 4 / 3 * np.pi * 1e-3),
-    "drum": (drum(ASIDE, AXIS, 0.1, 0.5), np.pi * 1e-2 * 0.5),
-    "ring": (ring(ASIDE, AXIS, 0.1, 0.02), 2 * np.pi**2 * 0.1 * 1e-4),
+    "drum": (drum(BESIDE, AXIS, 0.1, 0.5), np.pi * 1e-2 * 0.5),
+    "ring": (ring(BESIDE, AXIS, 0.1, 0.02), 2 * np.pi**2 * 0.1 * 1e-4),
 }
 
 
@@ -46,8 +46,8 @@ SHAPES = {
 def test_shapes_are_closed_and_of_their_size(name: str) -> None:
     shape, expected = SHAPES[name]
     surface = shape.surface
-    whole = pv.PolyData.from_regular_faces(surface.points, surface.triangles)
-    assert whole.n_open_edges == 0
+    poly_data = pv.PolyData.from_regular_faces(surface.points, surface.triangles)
+    assert poly_data.n_open_edges == 0
     corners = surface.points[surface.triangles]  # outwards: the volume is positive
     volume = np.linalg.det(corners - surface.points.mean(axis=0)).sum() / 6
     assert volume == pytest.approx(expected, rel=0.05)
@@ -56,9 +56,9 @@ def test_shapes_are_closed_and_of_their_size(name: str) -> None:
 def test_fingertips_of_the_body_touch_their_contacts(robot) -> None:
     for q in robot.random(np.random.default_rng(1), 5):
         points, normals = robot.contacts(q)
-        pads = [one for one in bodies_at(robot, q) if one.role == "pad"]
-        for one, point, normal in zip(pads, points, normals, strict=True):
-            corners = one.surface.points
+        pads = [body_part for body_part in bodies_at(robot, q) if body_part.role == "pad"]
+        for body_part, point, normal in zip(pads, points, normals, strict=True):
+            corners = body_part.surface.points
             assert np.linalg.norm(corners - point, axis=1).min() < 1.5e-3
             assert ((corners - point) @ normal).max() < 1e-3  # nothing beyond the pad
 
@@ -66,16 +66,16 @@ def test_fingertips_of_the_body_touch_their_contacts(robot) -> None:
 def test_a_link_without_a_shape_is_rods_to_what_it_carries() -> None:
     body = ik.load_robot("two_pandas+allegro")
     trunk, links = body.description.trunk_link, body.links(body.home)
-    assert trunk not in {one.link for one in body.description.shapes.capsules}
+    assert trunk not in {capsule.link for capsule in body.description.shapes.capsules}
     rods = [
-        one.transformed(links[trunk]).surface.points
-        for one in visual_bodies(body)
-        if one.frame == trunk
+        capsule.transformed(links[trunk]).surface.points
+        for capsule in visual_bodies(body)
+        if capsule.frame == trunk
     ]
     for side in ("left", "right"):
         for end in (links[trunk], links[f"{side}_panda_base"]):
-            away = np.linalg.norm(np.concatenate(rods) - end[:3, 3], axis=1)
-            assert away.min() < 0.036
+            distances = np.linalg.norm(np.concatenate(rods) - end[:3, 3], axis=1)
+            assert distances.min() < 0.036
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,11 @@ def test_a_link_without_a_shape_is_rods_to_what_it_carries() -> None:
     ],
 )
 def test_links_are_of_the_arm_or_of_a_hand(name: str, arm: set[str], hand: set[str]) -> None:
-    roles = {one.frame: one.role for one in visual_bodies(ik.load_robot(name)) if one.role != "pad"}
+    roles = {
+        body_part.frame: body_part.role
+        for body_part in visual_bodies(ik.load_robot(name))
+        if body_part.role != "pad"
+    }
     assert {link for link in arm | hand if roles[link] == "arm"} == arm
 
 
@@ -95,7 +99,7 @@ def test_links_are_of_the_arm_or_of_a_hand(name: str, arm: set[str], hand: set[s
 def test_the_ground_is_below_all_of_a_robot(name: str) -> None:
     robot = ik.load_robot(name)
     body = [*bodies_at(robot, robot.home), *bodies_at(robot, robot.home, collision_bodies(robot))]
-    heights = [one.surface.points[:, 2].min() for one in body]
+    heights = [body_part.surface.points[:, 2].min() for body_part in body]
     assert -2e-3 < ground_height(robot) - min(heights) < 0
     scene = ik.Scene({"pit": {"kind": "box", "size": [1, 1, 1], "xyz": [0, 0, -3]}})
     assert ground_height(robot, scene) == pytest.approx(-3.501)
@@ -119,11 +123,11 @@ def test_every_kind_of_contact_has_its_marks(robot, solution, changed, legend, s
         for name, axis in changed.items():
             vectors[name] = None if axis is None else frame[:3, axis]
         contacts[finger] = ik.Contact(frame[:3, 3] + 0.01 * frame[:3, 1], **vectors)
-    asked = ik.Grasp(contacts)
-    marks = contact_marks(robot, solution.q, asked, dict.fromkeys(robot.fingers, palette.MET))
-    assert sum(one.role == "target" for one in marks) == solids * len(robot.fingers)
-    assert {one.color for one in marks if one.role == "reached"} == {palette.MET}
-    (words, *_) = draw_solution(robot, solution, asked, dpi=40).legends[0].get_texts()
+    grasp = ik.Grasp(contacts)
+    marks = contact_marks(robot, solution.q, grasp, dict.fromkeys(robot.fingers, palette.MET))
+    assert sum(mark.role == "target" for mark in marks) == solids * len(robot.fingers)
+    assert {mark.color for mark in marks if mark.role == "reached"} == {palette.MET}
+    (words, *_) = draw_solution(robot, solution, grasp, dpi=40).legends[0].get_texts()
     assert words.get_text() == f"target: {legend}"
 
 
@@ -141,23 +145,23 @@ def test_the_place_asked_for_is_the_nearest_that_a_contact_allows() -> None:
 
 @pytest.fixture
 def stage():
-    with closing(Scene3D()) as made:
-        yield made
+    with closing(Scene3D()) as scene_3d:
+        yield scene_3d
 
 
 def test_the_camera_shows_all_points_within_its_margins(stage) -> None:
     points = np.random.default_rng(2).normal(size=(30, 3))
     stage.aim((0.7, 0.3), points, (200, 120), (0.1, 0.05))
-    seen = stage.project(points)
-    assert seen[:, 0].min() >= 20 - 1e-6
-    assert seen[:, 0].max() <= 180 + 1e-6
-    assert seen[:, 1].min() >= 6 - 1e-6
-    assert seen[:, 1].max() <= 114 + 1e-6
+    pixels = stage.project(points)
+    assert pixels[:, 0].min() >= 20 - 1e-6
+    assert pixels[:, 0].max() <= 180 + 1e-6
+    assert pixels[:, 1].min() >= 6 - 1e-6
+    assert pixels[:, 1].max() <= 114 + 1e-6
     right, up, towards = view_axes((0.7, 0.3))
     assert towards @ [np.cos(0.7), np.sin(0.7), 0] == pytest.approx(np.cos(0.3))
-    np.testing.assert_allclose(stage.project(points + towards), seen, atol=1e-6)
-    moved = stage.project(points + 0.1 * right + 0.1 * up) - seen
-    assert (moved * [1, -1] > 1).all()
+    np.testing.assert_allclose(stage.project(points + towards), pixels, atol=1e-6)
+    pixel_shift = stage.project(points + 0.1 * right + 0.1 * up) - pixels
+    assert (pixel_shift * [1, -1] > 1).all()
 
 
 def test_what_is_drawn_is_where_it_is_projected_to(stage) -> None:
@@ -171,8 +175,8 @@ def test_what_is_drawn_is_where_it_is_projected_to(stage) -> None:
 
 
 def test_the_floor_has_the_shadow_below_the_body(stage) -> None:
-    thing = [Drawable("ball", ball(0.1, (0.2, 0.3, 0.5)), "#ff0000")]
-    stage.add_floor(0.0, thing)
+    drawables = [Drawable("ball", ball(0.1, (0.2, 0.3, 0.5)), "#ff0000")]
+    stage.add_floor(0.0, drawables)
     stage.aim((0.4, 0.8), [[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0], [0, 0.5, 0]], (80, 80))
     image = stage.render("floor")
     dark = 1 - image[..., 0]

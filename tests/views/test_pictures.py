@@ -60,12 +60,12 @@ def test_a_dark_page_has_a_picture_of_its_own(robot, solution, grasp) -> None:
 
 
 def test_alternatives_are_drawn_side_by_side(robot, grasp) -> None:
-    found = ik.Solver(robot).solve_all(grasp, limit=2)
-    figure = views.draw_alternatives(robot, found, grasp, columns=2, dpi=40)
+    solutions = ik.Solver(robot).solve_all(grasp, limit=2)
+    figure = views.draw_alternatives(robot, solutions, grasp, columns=2, dpi=40)
     assert len(figure.axes) == 2
-    for axes, each in zip(figure.axes, found, strict=True):
-        start, end = each.branch.swivel
-        assert f"elbow {'+' if each.branch.elbow > 0 else '−'}" in axes.get_title()
+    for axes, solution in zip(figure.axes, solutions, strict=True):
+        start, end = solution.branch.swivel
+        assert f"elbow {'+' if solution.branch.elbow > 0 else '−'}" in axes.get_title()
         assert f"swivel range {np.rad2deg(end - start):.0f}°" in axes.get_title()
     images = [axes.images[0].get_array() for axes in figure.axes]
     assert np.abs(images[0] - images[1]).max() > 0.3
@@ -78,8 +78,8 @@ def test_the_picture_shows_object_target_and_contacts(robot, solution, grasp) ->
     for color in (palette.OBJECT, palette.TARGET, palette.MET):
         assert count(figure, color) > 20
     assert count(figure, palette.MISSED) == 0
-    without = dataclasses.replace(grasp, object="")
-    assert count(views.draw_solution(robot, solution, without, dpi=40), palette.OBJECT) <= 5
+    without_object = dataclasses.replace(grasp, object="")
+    assert count(views.draw_solution(robot, solution, without_object, dpi=40), palette.OBJECT) <= 5
 
 
 def test_a_missed_grasp_is_red(robot, grasp) -> None:
@@ -115,13 +115,13 @@ def test_a_target_far_away_does_not_shrink_the_close_up(robot, solution, grasp) 
     missed = {
         name: ik.solve.ContactVerdict(5.0, 0.0, False, ik.Tolerance()) for name in robot.fingers
     }
-    far = views.draw_solution(
+    far_picture = views.draw_solution(
         robot,
         dataclasses.replace(solution, contacts=missed),
         dataclasses.replace(grasp, contacts=contacts, object_pose=None),
         dpi=40,
     )
-    image = far.axes[1].images[0].get_array()
+    image = far_picture.axes[1].images[0].get_array()
     assert (image.min(axis=2) < 0.9).mean() > 0.1
 
 
