@@ -18,7 +18,7 @@ from casadi_ik.files.reading import read
 from casadi_ik.files.shipped import resolve_description
 from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links, largest_excess
 from casadi_ik.integrations.importing.meshes import IndexedMesh, merge_meshes
-from casadi_ik.integrations.importing.robot_shapes import may_touch
+from casadi_ik.integrations.importing.robot_shapes import allowed_overlaps
 from casadi_ik.model.linkage import link_poses
 from casadi_ik.model.parts import part_from_file
 from casadi_ik.model.schema import ArmFile, HandFile
@@ -66,7 +66,7 @@ def main() -> None:
         pieces = {str(i): surface for i, surface in enumerate(parts[link])}
         fitted = fit_links(pieces, pieces)
         shapes[link] = [shape for group in fitted.values() for shape in group]
-    touching = may_touch(part, shapes, surfaces)
+    touching = allowed_overlaps(part, shapes, surfaces)
     write(path, shapes, touching, options.names or options.file.name)
     count = sum(map(len, shapes.values()))
     for link, fitted_shapes in shapes.items():

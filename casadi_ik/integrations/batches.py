@@ -86,7 +86,7 @@ def backend(
 @contextmanager
 def _dask_loggers_disabled() -> Iterator[None]:
     """Disable the tracebacks that Dask logs for lost connections; relevant errors are raised."""
-    # These loggers have their own levels, so a level on a parent has no effect.
+    # These loggers set their levels, so a level on a parent has no effect.
     loggers = [
         logging.getLogger(name)
         for name in list(logging.root.manager.loggerDict)
@@ -322,12 +322,12 @@ class BatchFolder:
             with np.load(path, allow_pickle=False) as stored:
                 arrays = {name: stored[name] for name in stored.files}
         except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            raise InputError(f"{path}: damaged ({error}); remove it and resume") from error
+            raise InputError(f"{path}: file is damaged ({error}); remove it and resume") from error
         rows = arrays.pop("row", np.zeros(0))
         if not np.array_equal(rows, first_row + np.arange(count)):
-            found = f"{len(rows)} targets from {rows[0]} on" if len(rows) else "no row"
+            contents = f"{len(rows)} targets from {rows[0]} on" if len(rows) else "no row"
             raise InputError(
-                f"{path}: row: found {found}, expected {count} targets from "
+                f"{path}: row: found {contents}, expected {count} targets from "
                 f"{first_row} on; remove it and resume"
             )
         return arrays
@@ -428,7 +428,7 @@ REASON_DTYPE = np.dtype("<U9")
 
 
 def columns(solution: BatchSolution) -> dict[str, np.ndarray]:
-    """Return the arrays of a block as they are stored, one row per target."""
+    """Return the arrays of a block in the form in which they are stored, one row per target."""
     arrays: dict[str, np.ndarray] = {
         "q": solution.q,
         "success": solution.success,

@@ -47,7 +47,7 @@ def encode_contacts(points: ArrayLike, normals: ArrayLike, frame: str = "base") 
     quaternions = np.column_stack([np.zeros(len(x)), -x[:, 2], x[:, 1], 1 + x[:, 0]])
     quaternions[x[:, 0] < -1 + 1e-12] = 0, 0, 1, 0
     poses[:, 3:] = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
-    header = cdr((_now(), frame, len(poses)))
+    header = cdr((_time_stamp(), frame, len(poses)))
     return CDR_HEADER + header + bytes(-len(header) % 8) + poses.astype("<f8").tobytes()
 
 
@@ -66,7 +66,9 @@ def decode_contacts(data: bytes) -> tuple[Array, Array]:
         reader.position += -reader.position % 8
         values = np.frombuffer(reader.data, "<f8", count * POSE_SIZE, reader.position)
     except (struct.error, ValueError) as error:
-        raise InputError(f"contacts: no geometry_msgs/PoseArray in cdr: {error}") from error
+        raise InputError(
+            f"contacts: message is not a geometry_msgs/PoseArray in CDR: {error}"
+        ) from error
     poses = values.reshape(count, POSE_SIZE)
     unit, invalid = unit_quaternions(poses[:, 3:])
     malformed = invalid & np.isfinite(poses[:, 3:]).all(axis=1)  # NaN marks a free normal
@@ -89,7 +91,7 @@ class ContactNode:
 
     Attributes:
         status: Status of the last target.
-        refused: Why the last message was refused, or "".
+        refused: Reason why the last message was refused; "" if it was accepted.
 
     Example:
         >>> with ContactNode(ik.Solver(robot)) as node:
@@ -137,7 +139,7 @@ class ContactNode:
         if self.status is Status.SOLVED:
             self._q = q.copy()
             self._publisher.put(
-                cdr_message(_now(), "", self._names, self._q, self._empty, self._empty)
+                cdr_message(_time_stamp(), "", self._names, self._q, self._empty, self._empty)
             )
 
     def wait(self) -> None:
@@ -155,7 +157,8 @@ def _config() -> Any:
     return zenoh.Config.from_env() if "ZENOH_CONFIG" in os.environ else zenoh.Config()
 
 
-def _now() -> tuple[int, int]:
+def _time_stamp() -> tuple[int, int]:
+    """Return the current time in seconds and nanoseconds."""
     return divmod(time.time_ns(), 1_000_000_000)
 
 

@@ -345,8 +345,8 @@ def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
     )
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6)]
     triangles = corners[np.array([*faces, (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])]
-    fitted, overhang = capsules.fit(triangles, 3)
-    points, numbers = capsules.cut(triangles)
+    fitted, overhang = capsules.fit_capsules(triangles, 3)
+    points, numbers = capsules.subdivide(triangles)
     distances = np.min([capsule.distances_to(points) for capsule in fitted], axis=0)
     assert distances.max() <= 1e-12
     skin = np.concatenate([capsule.surface_points() for capsule in fitted])
@@ -365,7 +365,7 @@ def test_a_fine_mesh_is_simplified_by_less_than_a_cell_and_enclosed_as_a_whole()
     assert 500 < len(coarse.triangles) < len(mesh.triangles) / 2
     distances, _ = KDTree(coarse.points).query(mesh.points)
     assert distances.max() <= np.sqrt(3) * 0.08 / 40
-    fitted, overhang = capsules.fit(mesh.points[mesh.triangles], 1)
+    fitted, overhang = capsules.fit_capsules(mesh.points[mesh.triangles], 1)
     assert fitted[0].distances_to(mesh.points).max() <= 0
     assert fitted[0].radius < 0.0215
     assert overhang < 0.006

@@ -98,26 +98,27 @@ class FittedCapsule:
 
     def distances_to(self, points: Array) -> Array:
         """Return the distances (k,) of points from the capsule [m], negative inside."""
-        along = self.last - self.first
-        t = (points - self.first) @ along / max(float(along @ along), 1e-30)
-        foot = self.first + np.clip(t, 0, 1)[:, None] * along
-        return np.linalg.norm(points - foot, axis=1) - self.radius
+        segment = self.last - self.first
+        t = (points - self.first) @ segment / max(float(segment @ segment), 1e-30)
+        nearest = self.first + np.clip(t, 0, 1)[:, None] * segment
+        return np.linalg.norm(points - nearest, axis=1) - self.radius
 
     def surface_points(self) -> Array:
         """Return sample points (k, 3) of the surface [m]."""
-        along = self.last - self.first
-        length = float(np.linalg.norm(along))
-        axis = along / length if length > 1e-12 else np.array([0, 0, 1.0])
-        ball = sphere_directions(400)
-        up = ball @ axis
-        ends = np.where((up > 0)[:, None], self.last, self.first) + self.radius * ball
-        flat = ball - up[:, None] * axis
-        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
-        mantle = self.first + ((np.arange(len(ball)) * 0.618) % 1)[:, None] * along
-        return np.concatenate([ends, mantle + self.radius * flat])
+        segment = self.last - self.first
+        length = float(np.linalg.norm(segment))
+        axis = segment / length if length > 1e-12 else np.array([0, 0, 1.0])
+        directions = sphere_directions(400)
+        axial = directions @ axis
+        cap_centers = np.where((axial > 0)[:, None], self.last, self.first)
+        caps = cap_centers + self.radius * directions
+        radial = directions - axial[:, None] * axis
+        radial /= np.maximum(np.linalg.norm(radial, axis=1, keepdims=True), 1e-12)
+        axis_points = self.first + ((np.arange(len(directions)) * 0.618) % 1)[:, None] * segment
+        return np.concatenate([caps, axis_points + self.radius * radial])
 
 
-def fit(
+def fit_capsules(
     triangles: Array, max_capsules: int = 4, min_saving: float = SHAPE_FIT.min_saving
 ) -> tuple[list[FittedCapsule], float]:
     """Fit capsules that enclose a mesh.
@@ -136,10 +137,10 @@ def fit(
     """
     mesh = IndexedMesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
     coarse = mesh.simplified(SHAPE_FIT.triangles, SHAPE_FIT.cells)
-    pieces = _Pieces(cut(coarse.points[coarse.triangles]))
+    pieces = _Pieces(subdivide(coarse.points[coarse.triangles]))
     parts, capsules = _split(pieces, max_capsules, min_saving)
     if coarse is not mesh:
-        pieces = _Pieces(cut(triangles))
+        pieces = _Pieces(subdivide(triangles))
         outside = [
             capsule.distances_to(pieces.corners)[pieces.numbers].max(axis=1) for capsule in capsules
         ]
@@ -160,17 +161,17 @@ def _split(
     splits: list[list[_Split] | None] = [None]
 
     def enclosed(i: int, pair: Sequence[FittedCapsule]) -> float:
-        """Return the fraction of the samples inside if a pair replaces capsule i."""
-        others = [capsule for j, capsule in enumerate(capsules) if j != i]
-        distances = np.min([capsule.distances_to(samples) for capsule in (*others, *pair)], axis=0)
+        """Return the fraction of the samples inside the capsules if a pair replaces capsule i."""
+        replaced = [*(capsule for j, capsule in enumerate(capsules) if j != i), *pair]
+        distances = np.min([capsule.distances_to(samples) for capsule in replaced], axis=0)
         return float((distances <= 0).mean())
 
     while len(parts) < max_capsules:
         drafts: list[tuple[float, int, _Split]] = []
         for i, part in enumerate(parts):
-            known = splits[i] = splits[i] or pieces.splits(part)
-            drafts += [(enclosed(i, split.draft), i, split) for split in known]
-        # The capsules of a draft tell which splits are worth the search for better ones.
+            part_splits = splits[i] = splits[i] or pieces.splits(part)
+            drafts += [(enclosed(i, split.draft), i, split) for split in part_splits]
+        # The search for better axes is limited to the splits with the best draft capsules.
         drafts.sort(key=lambda draft: draft[0])
         options = [
             (enclosed(i, split.refined(pieces)), i, split)
@@ -178,10 +179,10 @@ def _split(
         ]
         if not options:
             break
-        min_size, i, split = min(options, key=lambda option: option[0])
-        if min_size > volume - min_saving:
+        new_volume, i, split = min(options, key=lambda option: option[0])
+        if new_volume > volume - min_saving:
             break
-        volume = min_size
+        volume = new_volume
         parts[i : i + 1], capsules[i : i + 1] = split.parts, split.refined(pieces)
         splits[i : i + 1] = [None, None]
     return parts, capsules
@@ -194,7 +195,7 @@ class _Pieces:
         corners: (c, 3) corners [m].
         numbers: (t, 3) rows of the corners of each triangle.
         centroids: (t, 3) centroids of the triangles [m].
-        outermost: (c,) whether a corner is the outermost one in its cell of a grid.
+        outermost: (c,) True for corners that are the outermost of their grid cell.
     """
 
     def __init__(self, mesh: tuple[Array, Rows]) -> None:
@@ -214,15 +215,15 @@ class _Pieces:
         member = np.zeros(len(self.corners), bool)
         member[self.numbers[rows]] = True
         outermost = self.corners[member & self.outermost]
-        enclosed = self.corners[member]
-        return around(
-            self.centroids[rows], outermost if len(outermost) else enclosed, enclosed, rounds
+        corners = self.corners[member]
+        return enclosing_capsule(
+            self.centroids[rows], outermost if len(outermost) else corners, corners, rounds
         )
 
     def splits(self, rows: Rows) -> list[_Split]:
-        """Return the ways to split the triangles of some rows in two."""
+        """Return candidate splits of the triangles of some rows into two parts."""
         candidates = []
-        for below in halves(self.centroids[rows]):
+        for below in candidate_splits(self.centroids[rows]):
             parts = rows[below], rows[~below]
             candidates.append(_Split(parts, [self.enclosing(part, 0) for part in parts]))
         return candidates
@@ -230,12 +231,12 @@ class _Pieces:
 
 @dataclass(eq=False)
 class _Split:
-    """Two parts of a mesh.
+    """A split of a part of a mesh into two parts.
 
     Attributes:
-        parts: Rows of the triangles of each.
-        draft: A capsule for each, along the first directions.
-        best: The smallest ones that the search for better axes yields, once it is made.
+        parts: Rows of the triangles of each part.
+        draft: Capsule of each part along a principal axis.
+        best: Capsule of each part after the search for better axes; empty before it.
     """
 
     parts: tuple[Rows, Rows]
@@ -248,40 +249,39 @@ class _Split:
         return self.best
 
 
-def around(
-    points: Array, candidates: Array, enclosed: Array, rounds: int = SHAPE_FIT.rounds
+def enclosing_capsule(
+    centroids: Array, candidates: Array, corners: Array, rounds: int = SHAPE_FIT.rounds
 ) -> FittedCapsule:
     """Return a small capsule that encloses points.
 
     Args:
-        points: (k, 3) centroids of triangles [m]: their spread tells which axes are tried.
-        candidates: (c, 3) corners of which the outermost determine the capsule.
-        enclosed: (m, 3) corners that the capsule encloses.
+        centroids: (k, 3) centroids of triangles, whose principal axes start the search [m].
+        candidates: (c, 3) corners; the outermost ones determine the capsule [m].
+        corners: (m, 3) corners that the capsule encloses [m].
         rounds: Number of rounds of the search for a better axis.
     """
-    offsets = points - points.mean(axis=0)
-    axes = np.linalg.eigh(offsets.T @ offsets)[1].T[::-1]
+    axes = _principal_axes(centroids)
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(SHAPE_FIT.corner_directions, 3))
     extreme = (directions @ np.ascontiguousarray(candidates.T)).argmax(axis=1)
-    picked = candidates[np.unique(extreme)]
-    best, axis = _smallest_along(picked, axes)
-    spread = 0.3
+    outermost = candidates[np.unique(extreme)]
+    best, axis = _smallest_along(outermost, axes)
+    perturbation = 0.3
     for _ in range(rounds):
-        tried = axis + spread * rng.normal(size=(SHAPE_FIT.axes_per_round, 3))
+        directions = axis + perturbation * rng.normal(size=(SHAPE_FIT.axes_per_round, 3))
         capsule, direction = _smallest_along(
-            picked, tried / np.linalg.norm(tried, axis=1, keepdims=True)
+            outermost, directions / np.linalg.norm(directions, axis=1, keepdims=True)
         )
         if capsule.volume < best.volume:
             best, axis = capsule, direction
-        spread *= 0.5
-    distance = best.distances_to(enclosed)
-    if rounds:  # the corners that are outside take part, so that the radius need not cover them
+        perturbation *= 0.5
+    distance = best.distances_to(corners)
+    if rounds:  # corners outside the capsule take part in a last fit, to keep its radius small
         outside = np.argpartition(-distance, min(SHAPE_FIT.extra_corners, len(distance)) - 1)[
             : SHAPE_FIT.extra_corners
         ]
-        capsule, _ = _smallest_along(np.concatenate([picked, enclosed[outside]]), axis[None])
-        widened = capsule.distances_to(enclosed)
+        capsule, _ = _smallest_along(np.concatenate([outermost, corners[outside]]), axis[None])
+        widened = capsule.distances_to(corners)
         if _with_radius_for(capsule, widened).volume < _with_radius_for(best, distance).volume:
             best, distance = capsule, widened
     return _with_radius_for(best, distance)
@@ -298,67 +298,75 @@ def _smallest_along(points: Array, axes: Array) -> tuple[FittedCapsule, Array]:
     side = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])
     side /= np.linalg.norm(side, axis=1, keepdims=True)
     frames = np.stack([side, np.cross(axes, side), axes], axis=2)
-    flat = points @ frames
-    across, z = flat[:, :, :2], flat[:, :, 2]
+    local = points @ frames
+    xy, z = local[:, :, :2], local[:, :, 2]
     rows = np.arange(len(axes))
-    center = (across.min(axis=1) + across.max(axis=1)) / 2
+    center = (xy.min(axis=1) + xy.max(axis=1)) / 2
     for i in range(16):  # towards the centre of the smallest circle
-        off = across - center[:, None]
-        far = (off**2).sum(axis=2).argmax(axis=1)
-        center = center + off[rows, far] / (i + 2)
-    distance = np.linalg.norm(across - center[:, None], axis=2)
+        offsets = xy - center[:, None]
+        farthest = (offsets**2).sum(axis=2).argmax(axis=1)
+        center = center + offsets[rows, farthest] / (i + 2)
+    distance = np.linalg.norm(xy - center[:, None], axis=2)
     radii = distance.max(axis=1)[:, None] * RADIUS_FACTORS
-    room = np.sqrt(np.maximum(radii[:, :, None] ** 2 - distance[:, None] ** 2, 0))
-    low, high = (z[:, None] + room).min(axis=2), (z[:, None] - room).max(axis=2)
+    cap_height = np.sqrt(np.maximum(radii[:, :, None] ** 2 - distance[:, None] ** 2, 0))
+    low, high = (z[:, None] + cap_height).min(axis=2), (z[:, None] - cap_height).max(axis=2)
     middle = (z.min(axis=1) + z.max(axis=1))[:, None] / 2
-    ball = np.hypot(distance, z - middle).max(axis=1)[:, None]
-    short = high < low
-    low, high = np.where(short, middle, low), np.where(short, middle, high)
-    radii = np.where(short, ball, radii)
+    sphere_radius = np.hypot(distance, z - middle).max(axis=1)[:, None]
+    is_sphere = high < low
+    low, high = np.where(is_sphere, middle, low), np.where(is_sphere, middle, high)
+    radii = np.where(is_sphere, sphere_radius, radii)
     volumes = radii**2 * (high - low + 4 / 3 * radii)
     a, r = np.unravel_index(int(volumes.argmin()), volumes.shape)
-    ends = [frames[a] @ np.array([*center[a], one[a, r]]) for one in (low, high)]
-    return FittedCapsule(ends[0], ends[1], float(radii[a, r])), axes[a]
+    first, last = (frames[a] @ np.array([*center[a], height[a, r]]) for height in (low, high))
+    return FittedCapsule(first, last, float(radii[a, r])), axes[a]
 
 
 def _points_inside(capsule: FittedCapsule) -> Array:
     """Return uniform sample points (k, 3) inside a capsule."""
     rng = np.random.default_rng(0)
-    ends = np.stack([capsule.first, capsule.last])
-    low, high = ends.min(axis=0) - capsule.radius, ends.max(axis=0) + capsule.radius
+    segment = np.stack([capsule.first, capsule.last])
+    low, high = segment.min(axis=0) - capsule.radius, segment.max(axis=0) + capsule.radius
     points = rng.uniform(low, high, (3 * SHAPE_FIT.samples, 3))
     return points[capsule.distances_to(points) <= 0][: SHAPE_FIT.samples]
 
 
-def halves(centroids: Array) -> list[NDArray[np.bool_]]:
-    """Return ways to split triangles with centroids (t, 3) in two: masks (t,) of one part."""
-    offsets = centroids - centroids.mean(axis=0)
-    axes = np.linalg.eigh(offsets.T @ offsets)[1].T[::-1]
+def candidate_splits(centroids: Array) -> list[NDArray[np.bool_]]:
+    """Return masks (t,) of one of two parts of triangles, split across their principal axes.
+
+    Args:
+        centroids: (t, 3) centroids of the triangles [m].
+    """
     masks = []
-    for axis in axes:
-        place = centroids @ axis
-        for share in (0.3, 0.5, 0.7):
-            below = place < place.min() + share * np.ptp(place)
+    for axis in _principal_axes(centroids):
+        coordinate = centroids @ axis
+        for fraction in (0.3, 0.5, 0.7):
+            below = coordinate < coordinate.min() + fraction * np.ptp(coordinate)
             if 4 <= below.sum() <= len(centroids) - 4:
                 masks.append(below)
     return masks
 
 
-def cut(triangles: Array) -> tuple[Array, Rows]:
+def _principal_axes(points: Array) -> Array:
+    """Return the principal axes (3, 3) of points in rows, the longest first."""
+    offsets = points - points.mean(axis=0)
+    return np.linalg.eigh(offsets.T @ offsets)[1].T[::-1]
+
+
+def subdivide(triangles: Array) -> tuple[Array, Rows]:
     """Subdivide triangles (t, 3, 3) with long edges; return corners (c, 3) and triangles (t, 3)."""
     corners = triangles.reshape(-1, 3)
-    reach = float(np.ptp(corners, axis=0).max()) / SHAPE_FIT.pieces_per_length
+    max_edge = float(np.ptp(corners, axis=0).max()) / SHAPE_FIT.pieces_per_length
     rows = np.arange(len(corners)).reshape(-1, 3)
-    finer = subdivide_to_size(corners, rows, reach, max_iter=50)
+    finer = subdivide_to_size(corners, rows, max_edge, max_iter=50)
     corners, numbers = np.unique(np.asarray(finer[0], dtype=float), axis=0, return_inverse=True)
     return corners, numbers.reshape(-1)[finer[1]]
 
 
 def excess(shapes: Sequence[FittedCapsule | FittedBox], points: Array) -> float:
     """Return the largest distance of shape surfaces from the points of a mesh [m], by samples."""
-    surface_points = np.concatenate([one.surface_points() for one in shapes])
-    samples = np.min([one.distances_to(surface_points) for one in shapes], axis=0) < -1e-6
-    return float(KDTree(points).query(surface_points[~samples])[0].max(initial=0.0))
+    samples = np.concatenate([shape.surface_points() for shape in shapes])
+    is_inside = np.min([shape.distances_to(samples) for shape in shapes], axis=0) < -1e-6
+    return float(KDTree(points).query(samples[~is_inside])[0].max(initial=0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,7 +396,7 @@ class FittedBox:
     def surface_points(self) -> Array:
         """Return sample points (k, 3) of the surface [m]."""
         line = np.linspace(-0.5, 0.5, SHAPE_FIT.box_points)
-        u, v = (one.ravel() for one in np.meshgrid(line, line))
+        u, v = (grid.ravel() for grid in np.meshgrid(line, line))
         faces = []
         for axis in range(3):
             for side in (-0.5, 0.5):
@@ -398,46 +406,46 @@ class FittedBox:
         return self.center + (np.concatenate(faces) * self.size) @ self.rotation.T
 
 
-def fit_boxes(triangles: Array, max_capsules: int = 3) -> list[FittedBox]:
-    """Fit at most `max_capsules` boxes that enclose triangles (t, 3, 3) [m]."""
-    corners, numbers = cut(triangles)
+def fit_boxes(triangles: Array, max_boxes: int = 3) -> list[FittedBox]:
+    """Fit at most `max_boxes` boxes that enclose triangles (t, 3, 3) [m]."""
+    corners, numbers = subdivide(triangles)
     parts = [corners[numbers]]
-    found = [box_around(parts[0].reshape(-1, 3))]
-    while len(parts) < max_capsules:
+    boxes = [enclosing_box(parts[0].reshape(-1, 3))]
+    while len(parts) < max_boxes:
         options = []
         for i, part in enumerate(parts):
-            for below in halves(part.mean(axis=1)):
-                two = part[below], part[~below]
-                pair = [box_around(one.reshape(-1, 3)) for one in two]
-                saved = found[i].volume - pair[0].volume - pair[1].volume
-                options.append((saved, i, two, pair))
+            for below in candidate_splits(part.mean(axis=1)):
+                halves = part[below], part[~below]
+                pair = [enclosing_box(corners.reshape(-1, 3)) for corners in halves]
+                saved = boxes[i].volume - pair[0].volume - pair[1].volume
+                options.append((saved, i, halves, pair))
         if not options:
             break
-        saved, i, two, pair = max(options, key=lambda option: option[0])
-        if saved < SHAPE_FIT.box_saving * sum(one.volume for one in found):
+        saved, i, halves, pair = max(options, key=lambda option: option[0])
+        if saved < SHAPE_FIT.box_saving * sum(box.volume for box in boxes):
             break
-        parts[i : i + 1], found[i : i + 1] = two, pair
-    return found
+        parts[i : i + 1], boxes[i : i + 1] = halves, pair
+    return boxes
 
 
-def box_around(points: Array) -> FittedBox:
+def enclosing_box(points: Array) -> FittedBox:
     """Return a small box around points (k, 3) [m], along the frame or the principal axes."""
     _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     if np.linalg.det(axes) < 0:
         axes[2] *= -1
-    found = []
+    boxes = []
     for rotation in (np.eye(3), axes.T):
         local = points @ rotation
         low, high = local.min(axis=0), local.max(axis=0)
-        found.append(FittedBox(rotation, rotation @ ((low + high) / 2), high - low))
-    # Principal axes only if they save volume: axes of the frame give simpler numbers.
-    return found[1] if found[1].volume < 0.9 * found[0].volume else found[0]
+        boxes.append(FittedBox(rotation, rotation @ ((low + high) / 2), high - low))
+    # The axes of the frame are preferred, because they give simpler numbers.
+    return boxes[1] if boxes[1].volume < 0.9 * boxes[0].volume else boxes[0]
 
 
 def fit_links(
-    surfaces: Mapping[str, IndexedMesh],
+    meshes: Mapping[str, IndexedMesh],
     flat: Collection[str],
-    known: Mapping[str, Sequence[ShapeEntry]] | None = None,
+    simple_shapes: Mapping[str, Sequence[ShapeEntry]] | None = None,
     max_capsules: int = SHAPE_FIT.max_capsules,
     min_saving: float = SHAPE_FIT.min_saving,
     report: Callable[[int], object] | None = None,
@@ -445,23 +453,23 @@ def fit_links(
     """Return the shapes that enclose links, by link.
 
     Args:
-        surfaces: Surfaces by link, in the link's frame.
-        flat: Links that boxes may enclose: a palm, which fingers come near.
-        known: Shapes by link that are simple already, and are not changed.
+        meshes: Meshes by link, in the frame of the link.
+        flat: Links that boxes may enclose, such as palms, to which fingers come close.
+        simple_shapes: Boxes, cylinders and so on by link, which are returned unchanged.
         max_capsules: Maximum number of capsules of a large link.
         min_saving: Fraction of the volume that another capsule has to save.
         report: Function called with the number of links that have been enclosed since.
     """
     shapes: dict[str, list[ShapeEntry]] = {}
-    for link, surface in surfaces.items():
-        extent = float(np.ptp(surface.points, axis=0).max())
-        if known and link in known:
-            shapes[link] = list(known[link])
-        elif len(surface.triangles) and extent > SHAPE_FIT.min_size:
+    for link, mesh in meshes.items():
+        extent = float(np.ptp(mesh.points, axis=0).max())
+        if simple_shapes and link in simple_shapes:
+            shapes[link] = list(simple_shapes[link])
+        elif len(mesh.triangles) and extent > SHAPE_FIT.min_size:
             count = (
                 max_capsules if extent > SHAPE_FIT.large_link else SHAPE_FIT.max_capsules_of_small
             )
-            triangles = surface.points[surface.triangles]
+            triangles = mesh.points[mesh.triangles]
             shapes[link] = _enclosing_shapes(triangles, count, link in flat, min_saving)
         if report is not None:
             report(1)
@@ -469,35 +477,35 @@ def fit_links(
 
 
 def _enclosing_shapes(
-    triangles: Array, max_capsules: int, flat: bool, min_saving: float
+    triangles: Array, max_capsules: int, is_flat: bool, min_saving: float
 ) -> list[ShapeEntry]:
     """Return enclosing capsules of a mesh, or boxes if they are allowed and closer."""
-    capsules, distances_to = fit(triangles, max_capsules, min_saving)
-    boxes = fit_boxes(triangles) if flat else []
+    capsules, capsule_excess = fit_capsules(triangles, max_capsules, min_saving)
+    boxes = fit_boxes(triangles) if is_flat else []
     if boxes:
-        closer = excess(boxes, cut(triangles)[0])
-        if closer < distances_to:
-            return [_box(one, _ceil(closer, 1e3)) for one in boxes]
-    return [_capsule(one, _ceil(distances_to, 1e3)) for one in capsules]
+        box_excess = excess(boxes, subdivide(triangles)[0])
+        if box_excess < capsule_excess:
+            return [_box_entry(box, _ceil(box_excess, 1e3)) for box in boxes]
+    return [_capsule_entry(capsule, _ceil(capsule_excess, 1e3)) for capsule in capsules]
 
 
-def _capsule(one: FittedCapsule, distances_to: float) -> ShapeEntry:
-    first, last = (_rounded(end) for end in (one.first, one.last))
-    radius = math.ceil(one.radius * SHAPE_FIT.grid + 0.9) / SHAPE_FIT.grid
+def _capsule_entry(capsule: FittedCapsule, capsule_excess: float) -> ShapeEntry:
+    first, last = (_rounded(end) for end in (capsule.first, capsule.last))
+    radius = math.ceil(capsule.radius * SHAPE_FIT.grid + 0.9) / SHAPE_FIT.grid
     if first == last:
-        return LinkSphereEntry(radius=radius, center=first, excess=distances_to)
-    return LinkCapsuleEntry(ends=(first, last), radius=radius, excess=distances_to)
+        return LinkSphereEntry(radius=radius, center=first, excess=capsule_excess)
+    return LinkCapsuleEntry(ends=(first, last), radius=radius, excess=capsule_excess)
 
 
-def _box(one: FittedBox, distances_to: float) -> ShapeEntry:
-    size = np.ceil(one.size * SHAPE_FIT.grid + 1.1) / SHAPE_FIT.grid
-    rpy = np.round(roll_pitch_yaw(one.rotation), 4)
-    if np.any(rpy):  # the largest effect of rounding the angles
+def _box_entry(box: FittedBox, box_excess: float) -> ShapeEntry:
+    size = np.ceil(box.size * SHAPE_FIT.grid + 1.1) / SHAPE_FIT.grid
+    rpy = np.round(roll_pitch_yaw(box.rotation), 4)
+    if np.any(rpy):  # enlarge the box by the largest effect of rounding the angles
         size = np.ceil((size + 1e-4 * np.linalg.norm(size)) * SHAPE_FIT.grid) / SHAPE_FIT.grid
     x, y, z = size.tolist()
     roll, pitch, yaw = (rpy + 0.0).tolist()
     return LinkBoxEntry(
-        size=(x, y, z), xyz=_rounded(one.center), rpy=(roll, pitch, yaw), excess=distances_to
+        size=(x, y, z), xyz=_rounded(box.center), rpy=(roll, pitch, yaw), excess=box_excess
     )
 
 
@@ -512,4 +520,4 @@ def _ceil(value: float, grid: float) -> float:
 
 def largest_excess(shapes: Mapping[str, Sequence[ShapeEntry]]) -> float:
     """Return the largest excess of shapes beyond the meshes that they enclose [m]."""
-    return max((one.excess for found in shapes.values() for one in found), default=0.0)
+    return max((shape.excess for entries in shapes.values() for shape in entries), default=0.0)

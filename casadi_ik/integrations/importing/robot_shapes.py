@@ -1,6 +1,7 @@
-"""The collision shapes of a whole robot from the files of its parts.
+"""Collision shapes of a robot from the files of its parts, and the pairs that may overlap.
 
-Links whose shapes touch although the meshes that they hold do not are told from sampled postures.
+Shapes are larger than the meshes that they enclose. Pairs of links whose shapes overlap although
+their meshes do not are found by random sampling of configurations.
 """
 
 from __future__ import annotations
@@ -28,47 +29,49 @@ from casadi_ik.model.xml_tree import RobotTree
 
 
 def hand_links(robot: RobotDescription) -> frozenset[str]:
-    """The links that the mount carries: all of the hand's file; none if there is no mount."""
+    """Return the links of the hand's file: those that the mount carries; none without a mount."""
     mounted = {joint.child for joint in robot.joints if joint.part == "mount"}
-    carried = {joint.child for link in mounted for joint in joints_below(robot, link)}
-    return frozenset(mounted | carried)
+    descendants = {joint.child for link in mounted for joint in joints_below(robot, link)}
+    return frozenset(mounted | descendants)
 
 
 @dataclass(frozen=True)
-class ContactSampling:
-    """How it is told whether links whose shapes touch may touch.
+class OverlapSampling:
+    """Parameters of the test whether two links may overlap.
 
     Attributes:
-        samples: Random configurations, seed 0.
-        enough: Configurations in which shapes touch that are enough to say that meshes never do.
-        looked_at: Of those, in so many the meshes are looked at.
-        first: Of these, the number that are examined before all others.
-        nested: Meshes that meet in a larger part of the configurations are built into each other.
-        told_apart: Part of the configurations without contact that an allowed overlap has to leave
-            free.
-        depth: Part of the depth at which meshes meet that shapes may overlap.
-        triangles: Number of triangles up to which a mesh is tested as it is.
+        samples: Number of random configurations, seed 0.
+        min_overlaps: Number of configurations with overlapping shapes below which a pair is not
+            tested.
+        tested: Maximum number of configurations with overlapping shapes in which meshes are tested.
+        first: Number of these configurations that are tested before all others.
+        nested: Fraction of the configurations above which intersecting meshes are regarded as built
+            into each other.
+        min_free_fraction: Minimum fraction of the configurations without intersection that an
+            allowed overlap has to accept.
+        depth_fraction: Fraction of the overlap at which meshes intersect that shapes may have.
+        max_triangles: Number of triangles up to which a mesh is tested unchanged.
         cells: Cells of the grid to which a finer mesh is simplified, along its longest edge.
     """
 
     samples: int = 2000
-    enough: int = 100
-    looked_at: int = 300
+    min_overlaps: int = 100
+    tested: int = 300
     first: int = 10
     nested: float = 0.5
-    told_apart: float = 0.5
-    depth: float = 0.9
-    triangles: int = 3000
+    min_free_fraction: float = 0.5
+    depth_fraction: float = 0.9
+    max_triangles: int = 3000
     cells: int = 48
 
 
-SAMPLING = ContactSampling()
+OVERLAP_SAMPLING = OverlapSampling()
 
 
-def may_touch(
+def allowed_overlaps(
     part: RobotPart | RobotDescription,
     shapes: Mapping[str, Sequence[ShapeEntry]],
-    surfaces: Mapping[str, IndexedMesh],
+    meshes: Mapping[str, IndexedMesh],
     report: Callable[[int], object] | None = None,
 ) -> list[Touching]:
     """Return the pairs of links whose shapes may overlap, each with the reason.
@@ -76,7 +79,7 @@ def may_touch(
     Args:
         part: An arm, a hand or a robot.
         shapes: Shapes by link.
-        surfaces: Meshes by link, which the shapes enclose.
+        meshes: Meshes by link, which the shapes enclose.
         report: Function called with the number of links whose pairs have been tested since.
     """
     poses = _random_poses(part, np.random.default_rng(0))
@@ -89,26 +92,26 @@ def may_touch(
 
     @cache
     def tree(link: str) -> CollisionTree:
-        mesh = surfaces[link].simplified(SAMPLING.triangles, SAMPLING.cells)
+        mesh = meshes[link].simplified(OVERLAP_SAMPLING.max_triangles, OVERLAP_SAMPLING.cells)
         return CollisionTree(mesh.points[mesh.triangles])
 
     touching: list[Touching] = []
     links = list(shapes)
     for i, link in enumerate(links):
-        for other in links[i + 1 :]:
-            if bodies[link] == bodies[other]:
+        for other_link in links[i + 1 :]:
+            if bodies[link] == bodies[other_link]:
                 continue
-            if frozenset((bodies[link], bodies[other])) in neighbours:
+            if frozenset((bodies[link], bodies[other_link])) in neighbours:
                 continue
             clearance = _clearances(
-                (capsules[link], capsules[other]), (segments[link], segments[other])
+                (capsules[link], capsules[other_link]), (segments[link], segments[other_link])
             )
             pair: MeshPair | None = None
             # Only the points of a mesh are known if it has too many triangles.
-            if all(name in surfaces and len(surfaces[name].triangles) for name in (link, other)):
-                relative = _inverse(poses[link]) @ poses[other]
-                pair = MeshPair(tree, (link, other), relative)
-            touching += _allowed_overlap((link, other), clearance, pair)
+            if all(name in meshes and len(meshes[name].triangles) for name in (link, other_link)):
+                relative = _inverse(poses[link]) @ poses[other_link]
+                pair = MeshPair(tree, (link, other_link), relative)
+            touching += _allowed_overlap((link, other_link), clearance, pair)
         if report is not None:
             report(1)
     return touching
@@ -119,10 +122,13 @@ def _random_poses(part: RobotPart | RobotDescription, rng: np.random.Generator) 
     lower, upper = (
         np.array([getattr(motor, end) for motor in part.actuators]) for end in ("lower", "upper")
     )
-    drawn = rng.uniform(lower, upper, (SAMPLING.samples, len(lower)))
-    motors = {motor.name: drawn[:, i] for i, motor in enumerate(part.actuators)}
+    positions = rng.uniform(lower, upper, (OVERLAP_SAMPLING.samples, len(lower)))
+    motors = {motor.name: positions[:, i] for i, motor in enumerate(part.actuators)}
     poses = link_poses(part.root, part.joints, joint_positions(part.joints, motors))
-    return {link: np.broadcast_to(pose, (SAMPLING.samples, 4, 4)) for link, pose in poses.items()}
+    return {
+        link: np.broadcast_to(pose, (OVERLAP_SAMPLING.samples, 4, 4))
+        for link, pose in poses.items()
+    }
 
 
 def _inverse(poses: Array) -> Array:
@@ -138,7 +144,7 @@ Capsules = Sequence[tuple[Array, Array, float]]
 
 def _clearances(capsules: tuple[Capsules, Capsules], segments: tuple[Array, Array]) -> Array:
     """Return the least distance (k,) of the capsules of two links [m], negative if they overlap."""
-    clearance = np.full(SAMPLING.samples, np.inf)
+    clearance = np.full(OVERLAP_SAMPLING.samples, np.inf)
     for i, (_, _, radius) in enumerate(capsules[0]):
         for j, (_, _, other_radius) in enumerate(capsules[1]):
             distance, _ = between_segments(segments[0][:, i], segments[1][:, j])
@@ -178,34 +184,38 @@ def _allowed_overlap(
         clearance: (k,) distance of their shapes by configuration [m].
         meshes: Their meshes; None if they are unknown.
     """
-    hit = np.flatnonzero(clearance < 0)
-    if len(hit) < SAMPLING.enough:
+    overlaps = np.flatnonzero(clearance < 0)
+    if len(overlaps) < OVERLAP_SAMPLING.min_overlaps:
         return []
-    examined, always = hit[: SAMPLING.looked_at], len(hit) == SAMPLING.samples
+    tested, always = overlaps[: OVERLAP_SAMPLING.tested], len(overlaps) == OVERLAP_SAMPLING.samples
     reason = (
-        f"their shapes touch in {len(hit)} of {SAMPLING.samples} random configurations, seed 0, "
+        f"their shapes touch in {len(overlaps)} of {OVERLAP_SAMPLING.samples} random "
+        "configurations, seed 0, "
     )
     if meshes is None:
-        return [Touching(links, reason + "their meshes were not looked at")] if always else []
+        return [Touching(links, reason + "their meshes are unknown")] if always else []
     # Most pairs that intersect do so in one of the first configurations.
-    batches = (examined[: SAMPLING.first], examined[SAMPLING.first :])
+    batches = (tested[: OVERLAP_SAMPLING.first], tested[OVERLAP_SAMPLING.first :])
     if not any(meshes.intersects(batch, stop_at_first=True).any() for batch in batches):
         return [Touching(links, reason + "their meshes in none")]
     if not always:
         return []
-    intersecting = meshes.intersects(examined)
-    reason += f"their meshes in {intersecting.sum()} of {len(examined)}"
-    # The allowed overlap is less than where the meshes intersect, if that tells the two apart.
-    depths = -clearance[examined]
+    intersecting = meshes.intersects(tested)
+    reason += f"their meshes in {intersecting.sum()} of {len(tested)}"
+    # The allowed overlap is below the smallest one at which the meshes intersect, unless that
+    # would forbid most of the configurations in which they do not.
+    depths = -clearance[tested]
     depth = (
-        math.floor(SAMPLING.depth * float(depths[intersecting].min()) * SHAPE_FIT.grid)
+        math.floor(
+            OVERLAP_SAMPLING.depth_fraction * float(depths[intersecting].min()) * SHAPE_FIT.grid
+        )
         / SHAPE_FIT.grid
     )
     if (
-        intersecting.mean() > SAMPLING.nested
-        or (depths[~intersecting] < depth).mean() < SAMPLING.told_apart
+        intersecting.mean() > OVERLAP_SAMPLING.nested
+        or (depths[~intersecting] < depth).mean() < OVERLAP_SAMPLING.min_free_fraction
     ):
-        return [Touching(links, reason + ", which these shapes cannot tell")]
+        return [Touching(links, reason + ", which these shapes cannot distinguish")]
     return [Touching(links, reason + ", all deeper", depth)]
 
 
@@ -227,44 +237,52 @@ def _segments(capsules: Capsules, poses: Array) -> Array:
 def robot_shapes(
     robot: RobotDescription, files: tuple[RobotTree | None, RobotTree]
 ) -> tuple[dict[str, list[ShapeEntry]], list[Touching], list[str]]:
-    """Shapes by link of the robot, links that may touch, and what could not be read.
+    """Return shapes by link, pairs of links that may overlap, and messages about unreadable files.
 
-    Simple shapes stay what they are; a mesh, or what is seen of a link that says nothing of
-    collisions, is held by few capsules.
+    Simple shapes are used unchanged. Collision meshes, or visual meshes of links without collision
+    shapes, are enclosed by few capsules or boxes.
 
     Args:
         robot: The robot, imported from the files.
-        files: The arm's, if it has one of its own, and the hand's.
+        files: Files of the arm and of the hand; the first is None if there is no file of the arm.
     """
-    surfaces: dict[str, IndexedMesh] = {}
+    meshes: dict[str, IndexedMesh] = {}
     simple: dict[str, list[ShapeEntry]] = {}
     notes: list[str] = []
-    taken: set[str] = set()
+    arm_names: set[str] = set()
     hand = hand_links(robot)
     for file in files:
         if file is None:
             continue
-        ours = {link: name_in_robot(link, robot.links, taken) for link in file.links}
-        wanted = {
+        robot_names = {link: name_in_robot(link, robot.links, arm_names) for link in file.links}
+        robot_names = {
             link: name
-            for link, name in ours.items()
+            for link, name in robot_names.items()
             if name in robot.links and (None in files or (name in hand) == (file is files[1]))
         }
-        found, said = link_meshes(file, wanted)
-        surfaces |= {wanted[link]: surface for link, surface in found.items()}
+        file_meshes, messages = link_meshes(file, robot_names)
+        meshes |= {robot_names[link]: mesh for link, mesh in file_meshes.items()}
         entries = file.shapes.entries
-        simple |= {wanted[link]: list(entries[link]) for link in wanted if link in entries}
-        notes += said
-        taken |= set(file.links)
-    ordered = {link: surfaces[link] for link in robot.links if link in surfaces}
+        simple |= {
+            name: list(entries[link]) for link, name in robot_names.items() if link in entries
+        }
+        notes += messages
+        arm_names |= set(file.links)
+    ordered = {link: meshes[link] for link in robot.links if link in meshes}
     palms = {side.palm_link for side in robot.sides} or {robot.palm_link}
     with progress(2 * len(ordered)) as report:
         shapes = fit_links(ordered, palms, simple, report=report)
-        touching = may_touch(robot, shapes, surfaces, report)
+        touching = allowed_overlaps(robot, shapes, meshes, report)
     return shapes, touching, notes
 
 
-def name_in_robot(name: str, names: tuple[str, ...], taken: set[str]) -> str:
-    """What a link or joint of a file is called in the robot."""
+def name_in_robot(name: str, names: tuple[str, ...], arm_names: set[str]) -> str:
+    """Return the name in the robot of a link or joint of a file.
+
+    Args:
+        name: Name in the file.
+        names: Names of all links or joints of the robot.
+        arm_names: Names in the arm's file; a hand's name that is among them is prefixed.
+    """
     prefixed = HAND_PREFIX + name
-    return prefixed if prefixed in names and name in taken else name
+    return prefixed if prefixed in names and name in arm_names else name

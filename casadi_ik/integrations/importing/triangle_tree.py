@@ -30,9 +30,10 @@ class CollisionTree:
         while order.shape[1] > 1:  # halve each box along its longest edge
             points = centroids[order]
             longest = np.ptp(points, axis=1).argmax(axis=1)
-            along = np.take_along_axis(points, longest[:, None, None], axis=2)[:, :, 0]
-            half = order.shape[1] // 2
-            order = np.take_along_axis(order, along.argpartition(half, axis=1), axis=1)
+            coordinates = np.take_along_axis(points, longest[:, None, None], axis=2)[:, :, 0]
+            middle = order.shape[1] // 2
+            partition = coordinates.argpartition(middle, axis=1)
+            order = np.take_along_axis(order, partition, axis=1)
             order = order.reshape(2 * len(order), -1)
         leaves = triangles[order[:, 0]]
         self.corners = np.ascontiguousarray(leaves.transpose(1, 2, 0))
@@ -45,14 +46,14 @@ class CollisionTree:
             self.levels.insert(0, _boxes(low, high))
 
     def intersects(
-        self, other: CollisionTree, poses: Array, stop_at_first: bool = False
+        self, other_tree: CollisionTree, poses: Array, stop_at_first: bool = False
     ) -> NDArray[np.bool_]:
         """Return in which relative poses a triangle of this mesh crosses one of another mesh.
 
-        Triangles in a common plane do not cross.
+        Triangles in a common plane do not count as crossing.
 
         Args:
-            other: The other mesh.
+            other_tree: Tree of the other mesh.
             poses: (k, 4, 4) poses of the other mesh's frame in the frame of this one.
             stop_at_first: Whether to return as soon as one pose with an intersection is known.
 
@@ -64,10 +65,10 @@ class CollisionTree:
         translations = np.ascontiguousarray(poses[:, :3, 3].T)
         zeros = np.zeros(len(poses), np.intp)
         stack = [(0, 0, zeros, zeros, np.arange(len(poses)))]
-        last = len(self.levels) - 1, len(other.levels) - 1
+        last = len(self.levels) - 1, len(other_tree.levels) - 1
         while stack:
             level, other_level, rows, columns, pose = stack.pop()
-            if len(rows) > MAX_PAIRS:  # depth first: an intersection makes the remainder needless
+            if len(rows) > MAX_PAIRS:  # depth first: an intersection makes the rest unnecessary
                 stack.append(
                     (level, other_level, rows[MAX_PAIRS:], columns[MAX_PAIRS:], pose[MAX_PAIRS:])
                 )
@@ -76,19 +77,20 @@ class CollisionTree:
             if not pending.all():
                 rows, columns, pose = rows[pending], columns[pending], pose[pending]
             rotation, translation = rotations[:, :, pose], translations[:, pose]
-            near = _overlap(
+            overlaps = _overlap(
                 [part[:, rows] for part in self.levels[level]],
-                [part[:, columns] for part in other.levels[other_level]],
+                [part[:, columns] for part in other_tree.levels[other_level]],
                 rotation,
                 translation,
             )
-            rows, columns, pose = rows[near], columns[near], pose[near]
+            rows, columns, pose = rows[overlaps], columns[overlaps], pose[overlaps]
             if not len(rows):
                 continue
             if (level, other_level) == last:
-                rotation, translation = rotation[:, :, near], translation[:, near]
+                rotation, translation = rotation[:, :, overlaps], translation[:, overlaps]
                 corners = [
-                    _dot(rotation, corner[:, columns]) + translation for corner in other.corners
+                    _dot(rotation, corner[:, columns]) + translation
+                    for corner in other_tree.corners
                 ]
                 crossed = _cross(self.corners[:, :, rows], np.stack(corners))
                 crossing[pose[crossed]] = True
@@ -123,17 +125,17 @@ def _dot(rotation: Array, vectors: Array) -> Array:
 
 
 def _overlap(
-    box: list[Array], other: list[Array], rotation: Array, translation: Array
+    box: list[Array], other_box: list[Array], rotation: Array, translation: Array
 ) -> NDArray[np.bool_]:
     """Return which pairs of boxes overlap along the axes of both frames (m,)."""
     absolute = np.abs(rotation)
-    offset = _dot(rotation, other[0]) + translation - box[0]
-    reach = box[1] + _dot(absolute, other[1])
-    near = (np.abs(offset) <= reach).all(axis=0)
-    back, absolute = rotation.transpose(1, 0, 2), absolute.transpose(1, 0, 2)
-    reach = other[1] + _dot(absolute, box[1])
-    separated = (np.abs(_dot(back, offset)) > reach).any(axis=0)
-    return np.logical_and(near, ~separated)
+    offset = _dot(rotation, other_box[0]) + translation - box[0]
+    reach = box[1] + _dot(absolute, other_box[1])
+    overlaps = (np.abs(offset) <= reach).all(axis=0)
+    inverse, absolute = rotation.transpose(1, 0, 2), absolute.transpose(1, 0, 2)
+    reach = other_box[1] + _dot(absolute, box[1])
+    separated = (np.abs(_dot(inverse, offset)) > reach).any(axis=0)
+    return np.logical_and(overlaps, ~separated)
 
 
 def _vector_product(a: Array, b: Array) -> Array:
@@ -146,11 +148,11 @@ def _inner(a: Array, b: Array) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _spans_plane(triangle: Array, other: Array) -> NDArray[np.bool_]:
+def _spans_plane(triangle: Array, other_triangle: Array) -> NDArray[np.bool_]:
     """Return for which pairs (3, 3, m) the second triangle crosses the plane of the first (m,)."""
     origin = triangle[0]
     normal = _vector_product(triangle[1] - origin, triangle[2] - origin)
-    heights = np.stack([_inner(corner - origin, normal) for corner in other])
+    heights = np.stack([_inner(corner - origin, normal) for corner in other_triangle])
     return (heights.min(axis=0) <= 0) & (heights.max(axis=0) >= 0)
 
 
@@ -170,13 +172,13 @@ def _cross(first: Array, second: Array) -> NDArray[np.bool_]:
         corner = faces[0]
         side, edge = faces[1] - corner, faces[2] - corner
         for i in range(3):
-            along, start = edges[(i + 1) % 3] - edges[i], edges[i] - corner
-            normal, turned = _vector_product(along, edge), _vector_product(start, side)
-            scale = _inner(side, normal)
+            direction, start = edges[(i + 1) % 3] - edges[i], edges[i] - corner
+            p, q = _vector_product(direction, edge), _vector_product(start, side)
+            determinant = _inner(side, p)
             with np.errstate(all="ignore"):
-                u = _inner(start, normal) / scale
-                v = _inner(along, turned) / scale
-                t = _inner(edge, turned) / scale
+                u = _inner(start, p) / determinant
+                v = _inner(direction, q) / determinant
+                t = _inner(edge, q) / determinant
                 through |= (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0) & (t <= 1)
     crossed[candidates[through]] = True
     return crossed
