@@ -27,6 +27,9 @@ SIGNS = tuple(product((1, -1), (1, -1), (1, -1)))
 EXACT_MODEL_ERROR = 1e-9
 """Model error below which a family solves the real arm [m and rad]."""
 
+FULL_TURN_MARGIN = 1e-4
+"""Distance of half a joint range from half a turn below which the joint has no limits [rad]."""
+
 ALIGNED_SINE_SQUARED = 1e-24
 """Squared sine of the second angle below which the first and third axis count as aligned."""
 
@@ -51,17 +54,50 @@ class Redundancy:
 
 
 @dataclass(frozen=True, eq=False)
+class JointAngle:
+    """An angle of a joint, and the direction from which it is computed.
+
+    Attributes:
+        value: Angle, centred on the range of the joint [rad].
+        direction: Cosine and sine of the angle plus the offset, times the length.
+        length: Length of the direction; zero where the angle is undetermined.
+        offset: Constant offset [rad].
+    """
+
+    value: Expr
+    direction: CosSin
+    length: Expr = 1.0
+    offset: float = 0.0
+
+    def limit_margin(self, lower: float, upper: float) -> Expr | None:
+        """Return a number that is >= 0 where the angle is within limits [rad].
+
+        It is the length times (cosine of the distance from the middle of the range, minus the
+        cosine of half the range). None: the range is a full turn.
+        """
+        half_range, middle = (upper - lower) / 2, (upper + lower) / 2 + self.offset
+        if half_range >= np.pi - FULL_TURN_MARGIN:
+            return None
+        aligned = self.direction.cosine * np.cos(middle) + self.direction.sine * np.sin(middle)
+        return aligned - self.length * np.cos(half_range)
+
+
+JointAngles = dict[int, JointAngle]
+"""Angles by joint number."""
+
+
+@dataclass(frozen=True, eq=False)
 class ElbowBranch:
     """A branch of an arm before the choice of wrist flips.
 
     Attributes:
-        joints: Angles by joint number [rad].
+        joints: Angles by joint number.
         wrist_flips: Pairs of alternative angles; the pairs are independent of each other.
         slack: Reach margin: >= 0 if the branch reaches the palm pose.
     """
 
-    joints: dict[int, Expr]
-    wrist_flips: tuple[tuple[dict[int, Expr], dict[int, Expr]], ...]
+    joints: JointAngles
+    wrist_flips: tuple[tuple[JointAngles, JointAngles], ...]
     slack: Expr
 
     def arms(self) -> list[Expr]:
@@ -71,8 +107,22 @@ class ElbowBranch:
             joints = dict(self.joints)
             for flip in flips:
                 joints |= flip
-            arms.append(ca.vertcat(*(joints[i] for i in range(len(joints)))))
+            arms.append(ca.vertcat(*(joints[i].value for i in range(len(joints)))))
         return arms
+
+    def limit_margin(self, lower: Array, upper: Array) -> Expr:
+        """Return a number that is >= 0 if the branch exists within limits (n,) [rad]."""
+        margins = [self.slack, *_limit_margins(self.joints, lower, upper)]
+        for pair in self.wrist_flips:
+            flips = [_limit_margins(flip, lower, upper) for flip in pair]
+            if all(flips):
+                margins.append(ca.fmax(*(ca.mmin(ca.vertcat(*flip)) for flip in flips)))
+        return ca.mmin(ca.vertcat(*margins))
+
+
+def _limit_margins(joints: JointAngles, lower: Array, upper: Array) -> list[Expr]:
+    margins = [angle.limit_margin(float(lower[i]), float(upper[i])) for i, angle in joints.items()]
+    return [margin for margin in margins if margin is not None]
 
 
 class Score(ABC):
@@ -260,19 +310,22 @@ class ClosedForm(ArmFamily):
         return best[1], best[0]
 
     def _evaluate(
-        self, joints: dict[int, Expr], score: Score, lower: Expr, upper: Expr, reference: Expr
+        self, joints: JointAngles, score: Score, lower: Expr, upper: Expr, reference: Expr
     ) -> tuple[dict[int, Expr], Expr, Expr]:
         """Return joints in their preferred turns, their cost and their limit margin."""
         multi_turn = self.screws.multi_turn_joints
         unwrapped = {
-            i: score.unwrap(i, angle, lower, upper, reference) if i in multi_turn else angle
+            i: score.unwrap(i, angle.value, lower, upper, reference)
+            if i in multi_turn
+            else angle.value
             for i, angle in joints.items()
         }
         return unwrapped, score.cost(unwrapped, reference), margin(unwrapped, lower, upper)
 
-    def angle(self, index: int, cos_sin: CosSin) -> dict[int, Expr]:
+    def angle(self, index: int, cos_sin: CosSin) -> JointAngles:
         """Return the angle of a screw's joint, centred on its range."""
-        return {self.screws.joints[index]: self.screws.centred(index, cos_sin.angle)}
+        value = self.screws.centred(index, cos_sin.angle)
+        return {self.screws.joints[index]: JointAngle(value, cos_sin)}
 
 
 def margin(joints: dict[int, Expr], lower: Expr, upper: Expr) -> Expr:
@@ -325,8 +378,8 @@ class SphericalJoints:
     frame: Array
     offset: float
 
-    def triples(self, screws: Screws, rotation: Expr) -> tuple[dict[int, Expr], dict[int, Expr]]:
-        """Return both triples of angles by joint that produce a rotation (3, 3) [rad]."""
+    def triples(self, screws: Screws, rotation: Expr) -> tuple[JointAngles, JointAngles]:
+        """Return both triples of angles by joint that produce a rotation (3, 3)."""
         return self.angles_of(screws, self.euler_matrix(rotation))
 
     def euler_matrix(self, rotation: Expr) -> Expr:
@@ -336,8 +389,8 @@ class SphericalJoints:
         c, s = float(np.cos(self.offset)), float(np.sin(self.offset))
         return local @ ca.sparsify(ca.DM([[c, 0, s], [0, 1, 0], [-s, 0, c]]))
 
-    def angles_of(self, screws: Screws, matrix: Expr) -> tuple[dict[int, Expr], dict[int, Expr]]:
-        """Return both triples of angles of an `euler_matrix`, by joint [rad].
+    def angles_of(self, screws: Screws, matrix: Expr) -> tuple[JointAngles, JointAngles]:
+        """Return both triples of angles of an `euler_matrix`, by joint.
 
         If the first and third axis are aligned, the first angle is zero and the third makes the
         whole rotation.
@@ -356,12 +409,24 @@ class SphericalJoints:
         )
         pi = np.pi
         triples = []
-        for angles in ((first, second, third), (first + pi, -second, third + pi)):
+        # The directions of the first and third angle shrink to zero where their axes align.
+        length = ca.sqrt(squared)
+        for sign, angles in (
+            (1.0, (first, second, third)),
+            (-1.0, (first + pi, -second, third + pi)),
+        ):
             shifted = (angles[0], angles[1] - self.offset, angles[2])
+            directions = (
+                (CosSin(sign * matrix[0, 2], sign * matrix[1, 2]), length, 0.0),
+                (CosSin(matrix[2, 2], sign * length), 1.0, self.offset),
+                (CosSin(-sign * matrix[2, 0], sign * matrix[2, 1]), length, 0.0),
+            )
             triples.append(
                 {
-                    screws.joints[index]: screws.centred(index, angle)
-                    for index, angle in zip(self.indices, shifted, strict=True)
+                    screws.joints[index]: JointAngle(screws.centred(index, angle), *direction)
+                    for index, angle, direction in zip(
+                        self.indices, shifted, directions, strict=True
+                    )
                 }
             )
         return triples[0], triples[1]

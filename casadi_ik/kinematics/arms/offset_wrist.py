@@ -195,8 +195,12 @@ class OffsetWristArm(ArmFamily):
         shifted_palm = Pose(rotation, origin + rotation @ shift)
         (bend,) = self.ideal.branches_of_six(shifted_palm, (sign_1, sign_2))
         ((plus, minus),) = bend.wrist_flips
-        flips = {joint: ca.if_else(flip > 0, angle, minus[joint]) for joint, angle in plus.items()}
-        joints = bend.joints | flips
+        joints = {joint: angle.value for joint, angle in bend.joints.items()}
+        flips = {
+            joint: ca.if_else(flip > 0, angle.value, minus[joint].value)
+            for joint, angle in plus.items()
+        }
+        joints |= flips
         arm = ca.vertcat(*(joints[self.screws.joints[index]] for index in self.ideal.indices))
         residual = flips[self.last] - t
         residual -= FULL_TURN * ca.floor(residual / FULL_TURN + 0.5)

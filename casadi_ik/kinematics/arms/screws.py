@@ -7,7 +7,9 @@ returned, and zero if the axis passes through the point: results are never NaN.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -183,12 +185,36 @@ class CosSin:
         )
 
 
+_CLIPS_DIRECTIONS: ContextVar[bool] = ContextVar("clips_directions", default=False)
+
+
+@contextmanager
+def clipped_directions() -> Iterator[None]:
+    """Clip cosines and sines to [-1, 1] in the graphs that are built in this context.
+
+    In exact arithmetic nothing changes, but intervals cannot know that cosines and sines of wide
+    intervals are bounded.
+    """
+    token = _CLIPS_DIRECTIONS.set(True)
+    try:
+        yield
+    finally:
+        _CLIPS_DIRECTIONS.reset(token)
+
+
+def _direction(cosine: Expr, sine: Expr) -> CosSin:
+    """Return an angle, with cosine and sine clipped in the context of `clipped_directions`."""
+    if _CLIPS_DIRECTIONS.get():
+        cosine, sine = (ca.fmin(ca.fmax(part, -1.0), 1.0) for part in (cosine, sine))
+    return CosSin(cosine, sine)
+
+
 def cos_sin_of(cosine: Expr, sine: Expr) -> CosSin:
     """Return the angle of a direction of any length; zero if it has no length."""
     squared = cosine * cosine + sine * sine
     scale = 1 / ca.sqrt(ca.fmax(squared, MIN_SQUARED_PRODUCT))
     has_length = squared > MIN_SQUARED_PRODUCT
-    return CosSin(
+    return _direction(
         ca.if_else(has_length, cosine * scale, 1.0), ca.if_else(has_length, sine * scale, 0.0)
     )
 
@@ -209,7 +235,7 @@ def subproblem_4(cosine: Expr, sine: Expr, height: Expr) -> tuple[CosSin, CosSin
     clipped = ca.fmin(ca.fmax(height, -length), length)
     has_length = squared > MIN_SQUARED_LENGTH
     solutions = [
-        CosSin(
+        _direction(
             ca.if_else(has_length, (cosine * clipped - sine * side) / safe, 1.0),
             ca.if_else(has_length, (sine * clipped + cosine * side) / safe, 0.0),
         )

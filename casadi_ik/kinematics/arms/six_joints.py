@@ -16,7 +16,14 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.arms.family import ClosedForm, ElbowBranch, Redundancy, SphericalJoints
+from casadi_ik.kinematics.arms.family import (
+    ClosedForm,
+    ElbowBranch,
+    JointAngle,
+    JointAngles,
+    Redundancy,
+    SphericalJoints,
+)
 from casadi_ik.kinematics.arms.screws import (
     CosSin,
     Screws,
@@ -65,7 +72,9 @@ class SixJoints(ClosedForm):
         branches = self.branches_of_six(self.remaining_motion(palm, redundancy), signs)
         if not self.swept:
             return branches
-        swept_joint = {self.screws.joints[0]: redundancy[0]}
+        value = redundancy[0]
+        direction = CosSin(ca.cos(value), ca.sin(value))
+        swept_joint = {self.screws.joints[0]: JointAngle(value, direction)}
         return [
             ElbowBranch(bend.joints | swept_joint, bend.wrist_flips, bend.slack)
             for bend in branches
@@ -107,7 +116,7 @@ class SphericalArm(SixJoints):
         return self.motion_out_of_reach(self.screws.motion(palm), lower, upper)
 
     def _branch(
-        self, joints: dict[int, Expr], angles: list[CosSin], motion: Pose, slack: Expr
+        self, joints: JointAngles, angles: list[CosSin], motion: Pose, slack: Expr
     ) -> ElbowBranch:
         """Return the elbow branch of three angles and the remaining rotation."""
         remaining_motion = motion.rotation

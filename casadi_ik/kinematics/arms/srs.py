@@ -18,8 +18,14 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.arms.family import ClosedForm, ElbowBranch, Redundancy, SphericalJoints
-from casadi_ik.kinematics.arms.screws import Screws, subproblem_4
+from casadi_ik.kinematics.arms.family import (
+    ClosedForm,
+    ElbowBranch,
+    JointAngle,
+    Redundancy,
+    SphericalJoints,
+)
+from casadi_ik.kinematics.arms.screws import CosSin, Screws, subproblem_4
 from casadi_ik.kinematics.forward import Pose
 from casadi_ik.kinematics.se3 import rotation_between, skew
 from casadi_ik.kinematics.smooth import Expr, call_function, safe_norm
@@ -120,7 +126,8 @@ class SrsArm(ClosedForm):
                 sphere.angles_of(self.screws, constant + cosine * cos_term + sine * sin_term)
                 for sphere, (constant, cos_term, sin_term) in zip(joints, spheres, strict=True)
             )
-            branches.append(ElbowBranch({3: elbow}, flips, slack))
+            turn, _ = self._elbow_turn(ca.sumsqr(self._shoulder_to_wrist(palm)), sign)
+            branches.append(ElbowBranch({3: JointAngle(elbow, turn)}, flips, slack))
         return branches
 
     def breakpoints(self, palm: Pose, signs: tuple[Expr, ...], lower: Expr, upper: Expr) -> Expr:
@@ -160,16 +167,21 @@ class SrsArm(ClosedForm):
         elbow, slack, *matrices = self._elbow_function(ca.sumsqr(line), direction, rotation, sign)
         return elbow, slack, tuple(matrices[:3]), tuple(matrices[3:])  # type: ignore[return-value]
 
+    def _elbow_turn(self, squared: Expr, sign: Expr) -> tuple[CosSin, Expr]:
+        """Return the elbow angle at a squared distance S-W for a sign, and its reach margin."""
+        axis, upper, fore = self.screws.axes[3], self.upper_arm, self.forearm
+        cos_part, sin_part = 2 * float(upper @ fore), 2 * float(upper @ np.cross(axis, fore))
+        height = squared - float(upper @ upper + fore @ fore)
+        first, second, slack = subproblem_4(ca.SX(cos_part), ca.SX(sin_part), height)
+        return first.select(sign > 0, second), slack
+
     @cached_property
     def _elbow_function(self) -> ca.Function:
         """Function (squared distance, unit vector S-W, rotation, sign) -> `_without_swivel`."""
         axis, upper, fore = self.screws.axes[3], self.upper_arm, self.forearm
         squared, sign = ca.SX.sym("squared"), ca.SX.sym("sign")
         direction, rotation = ca.SX.sym("along", 3), ca.SX.sym("turned", 3, 3)
-        cos_part, sin_part = 2 * float(upper @ fore), 2 * float(upper @ np.cross(axis, fore))
-        height = squared - float(upper @ upper + fore @ fore)
-        first, second, slack = subproblem_4(ca.SX(cos_part), ca.SX(sin_part), height)
-        turn = first.select(sign > 0, second)
+        turn, slack = self._elbow_turn(squared, sign)
         B = turn.rotation(axis)
         stretched = ca.DM(upper) + B @ ca.DM(fore)
         A_0 = rotation_between(stretched / ca.fmax(safe_norm(stretched), MIN_LENGTH), direction)

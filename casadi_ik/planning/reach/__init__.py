@@ -1,0 +1,1 @@
+"""Certified reachability: maps of palm poses, and the placement of the base."""
