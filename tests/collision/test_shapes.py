@@ -138,7 +138,7 @@ def test_capsules_hold_boxes_and_cylinders(shape, rng):
         (("links", "l1", 0, "radius"), "5 deg", "found '5 deg', expected m"),
         (("touching",), [{"links": ["l1", "x"], "reason": "a"}], "unknown link 'x'"),
         (("touching",), [{"links": ["l1", "l3"], "reason": " "}], "reason: is empty"),
-        (("source",), "nobody", "unknown tag 'nobody'"),
+        (("source",), "nobody", "tag 'nobody' is unknown"),
         (("srdf",), "none.srdf", "none.srdf: cannot be read"),
     ],
 )
