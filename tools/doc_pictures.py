@@ -1,9 +1,10 @@
 """Draw the pictures of the documentation that no single command draws.
 
     python tools/doc_pictures.py --out docs --only contacts scene pairs unreachable humanoid
+    python tools/doc_pictures.py --out docs --only arms hands bodies
 
 The pictures show the frames of a contact, an obstacle with and without a scene, eight arm-hands, an
-unreachable grasp, and a humanoid that holds a box.
+unreachable grasp, a humanoid that holds a box, and all built-in arms, hands and multi-arm robots.
 """
 
 from __future__ import annotations
@@ -50,6 +51,15 @@ POST = {
     "table": {"kind": "box", "size": [2.0, 2.0, 0.04], "xyz": [0, 0, -0.02]},
     "post": {"kind": "cylinder", "radius": 0.04, "length": 1.0},
 }
+
+
+MODELS = Path(__file__).parents[1] / "models"
+
+GALLERIES = {"arms": (6, (150, 190)), "hands": (5, (180, 170)), "bodies": (4, (225, 260))}
+"""Number of columns and size of an image [pixels] of each gallery; folders of `models`."""
+
+HANDS_OF_BODIES = {"two_ur10e": "two_ur10e+robotiq_2f85"}
+"""Robots that stand for bodies whose file names no hand."""
 
 
 def shot(
@@ -200,11 +210,34 @@ def pairs(path: Path) -> None:
     images, titles = [], []
     for name, title in PAIRS:
         robot = ik.load_robot(name)
-        tip = robot.contacts(robot.home)[0].mean(axis=0)
-        view = (float(np.arctan2(tip[1], tip[0]) - np.deg2rad(62.0)), float(np.deg2rad(16.0)))
-        images.append(shot(robot, robot.home, view, (170, 230)))
+        images.append(shot(robot, robot.home, gallery_view(robot), (170, 230)))
         titles.append(title)
     save_picture(panels(images, titles, (13.6, 2.55)), path)
+
+
+def gallery(path: Path) -> None:
+    """Draw all robots of a folder of `models` in their home configurations, with their names."""
+    columns, pixels = GALLERIES[path.stem]
+    names = sorted(file.stem for file in (MODELS / path.stem).glob("*.yaml"))
+    rows = -(-len(names) // columns)
+    width, height = 1 / columns, 1 / rows
+    figure = new_figure(columns * pixels[0] / 100, rows * (pixels[1] / 100 + 0.25), dpi=100)
+    for i, name in enumerate(names):
+        robot = ik.load_robot(HANDS_OF_BODIES.get(name, name))
+        left, bottom = i % columns * width, 1 - (i // columns + 1) * height
+        label = 0.25 / (pixels[1] / 100 + 0.25) * height
+        axes = figure.add_axes((left, bottom + label, width, height - label))
+        axes.set_axis_off()
+        axes.imshow(shot(robot, robot.home, gallery_view(robot), pixels))
+        middle = (left + width / 2, bottom + label / 2)
+        figure.text(*middle, name, ha="center", va="center", size=9, color=palette.INK)
+    save_picture(figure, path)
+
+
+def gallery_view(robot: ik.ArmHand) -> View:
+    """Return azimuth and elevation from which a robot is seen from its side."""
+    tip = robot.contacts(robot.home)[0].mean(axis=0)
+    return (float(np.arctan2(tip[1], tip[0]) - np.deg2rad(62.0)), float(np.deg2rad(16.0)))
 
 
 def unreachable(path: Path) -> None:
@@ -280,6 +313,7 @@ def main(arguments: list[str] | None = None) -> None:
         "pairs": pairs,
         "unreachable": unreachable,
         "humanoid": humanoid,
+        **dict.fromkeys(GALLERIES, gallery),
     }
     parser = argparse.ArgumentParser(description="Pictures of the documentation.")
     parser.add_argument("--out", type=Path, default=Path("docs"), help="output folder")
