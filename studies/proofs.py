@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 from impossible_targets import CLASSES, classes_of, impossible, rigidly_moved
-from misses import ROBOTS as SHIPPED_AND_MADE
-from misses import load
+from missed_targets import ROBOTS as SHIPPED_AND_MADE
+from missed_targets import load
 from runner.parts import read_parts, run_parts
 from runner.report import (
     Metric,

@@ -12,7 +12,8 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from peers import Mink, starts_of
+from peer_solvers import Mink
+from peers import starts_of
 
 import casadi_ik as ik
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck

@@ -8,6 +8,7 @@ from pathlib import Path
 import bench
 import bench_parts
 import numpy as np
+import peer_solvers
 import peers
 import pytest
 
@@ -60,7 +61,7 @@ def test_rows_above_a_ratio_are_reported():
 def test_peers_see_the_robot_that_we_solve(name):
     """Couplings with offsets and several followers of a motor are in their URDF."""
     robot = ik.load_robot(name)
-    contacts = peers.PinContacts(robot)
+    contacts = peer_solvers.PinContacts(robot)
     q = robot.random(np.random.default_rng(0), 5)
     for q_row, points, normals in zip(q, *robot.contacts(q), strict=True):
         points_of_peer, rotations = contacts.at(contacts.model.createData(), q_row)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import missed_targets
 import misses
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ import casadi_ik as ik
 ONE_CASE = ["--robots", "kuka_lwr_barrett", "--tolerance", "default"]
 
 
-@pytest.mark.parametrize("name", [*misses.ROBOTS[-2:], "kuka_lwr_barrett"])
+@pytest.mark.parametrize("name", [*missed_targets.ROBOTS[-2:], "kuka_lwr_barrett"])
 def test_targets_are_within_limits(rng, name):
-    robot = misses.load(name)
+    robot = missed_targets.load(name)
     for sampler, (_, draw) in SAMPLERS.items():
         if suits(robot, sampler):
             q = draw(robot, rng, 40)
@@ -59,10 +60,10 @@ def test_a_search_goes_on_and_climbs(tmp_path):
 
 
 def test_pairs_and_fingers():
-    toured = misses.robots_of(["tour"])
+    toured = missed_targets.robots_of(["tour"])
     assert {name.split("+")[0] for name in toured} == set(ik.shipped_names("arms"))
     assert {name.split("+")[1] for name in toured} == set(ik.shipped_names("hands"))
-    assert set(toured) < set(misses.robots_of(["pairs"]))
+    assert set(toured) < set(missed_targets.robots_of(["pairs"]))
     robot = ik.load_robot("panda+allegro_right")
     sets = finger_sets(robot, ["all", "3", "4", "thumb+ring"])
     assert set(sets) == {"all", "3", "thumb+ring"}
