@@ -26,7 +26,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from bench_parts import ABROAD, CASES, SHARED, Case
+from bench_parts import ABROAD, CASES
+from bench_solves import SHARED, Case
 from rich.console import Console
 from runner.parts import code_version
 from runner.report import command, commit, markdown_table, program, publish

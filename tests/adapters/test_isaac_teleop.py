@@ -46,7 +46,7 @@ def flat_hand() -> np.ndarray:
     return poses
 
 
-def test_a_tracked_hand_moves_the_robot_and_a_lost_one_stops_it(tmp_path):
+def test_tracked_hand_moves_robot_and_lost_hand_stops_it(tmp_path):
     (tmp_path / "hand.yaml").write_text(YAML)
     robot = ik.load_robot("panda+allegro_right")
     follower = ik.Solver(robot).follow(robot.home, period=0.01)

@@ -36,7 +36,7 @@ def pipeline(*steps):
     )
 
 
-def test_a_pose_of_the_tool_through_lerobots_own_step(arm, rng):
+def test_tool_pose_through_lerobot_step(arm, rng):
     names = [*arm.joint_names, "gripper"]
     step = InverseKinematicsEEToJoints(kinematics=arm, motor_names=names)
     robot = ik.load_robot("ur5e")
@@ -56,7 +56,7 @@ def test_a_pose_of_the_tool_through_lerobots_own_step(arm, rng):
         assert np.linalg.norm(pose_sent[:3, :3] - pose[:3, :3]) < 0.1
 
 
-def test_the_palm_of_an_arm_with_a_hand(rng):
+def test_palm_pose_of_arm_with_hand(rng):
     robot = ik.load_robot("panda+allegro_right")
     arm = ArmKinematics(ik.Solver(robot))
     assert arm.joint_names == list(robot.actuators[:7])
@@ -69,7 +69,7 @@ def test_the_palm_of_an_arm_with_a_hand(rng):
         arm.inverse_kinematics(angles, pose, orientation_weight=0)
 
 
-def test_poses_of_a_position_alone_and_out_of_reach(arm):
+def test_unreachable_pose_is_approached_by_position(arm):
     robot = ik.load_robot("ur5e")
     angles_before = np.array([*np.rad2deg(robot.home), 30.0])
     pose = np.eye(4)
@@ -88,7 +88,7 @@ def test_poses_of_a_position_alone_and_out_of_reach(arm):
 
 
 @pytest.mark.parametrize("orientation_weight", [0.01, 0.001])
-def test_an_arm_that_is_led_out_of_reach_is_where_least_squares_leads(arm, orientation_weight):
+def test_unreachable_path_follows_least_squares(arm, orientation_weight):
     """LeRobot's weights multiply squared errors."""
     robot = ik.load_robot("ur5e")
     degrees = np.rad2deg(robot.home)
@@ -114,7 +114,7 @@ def test_an_arm_that_is_led_out_of_reach_is_where_least_squares_leads(arm, orien
     assert np.linalg.norm(arm.forward_kinematics(degrees)[:3, 3] - expected) < 2e-4
 
 
-def test_contacts_of_an_action_become_targets_of_the_motors(rng):
+def test_action_contacts_become_motor_targets(rng):
     robot = ik.load_robot("panda+allegro_right")
     step = ContactsToJoints(ik.Solver(robot))
     points, normals = robot.contacts(robot.random(rng, 1)[0])

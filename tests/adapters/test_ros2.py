@@ -48,7 +48,7 @@ def node() -> Iterator[int]:
         assert "PoseArray" in process.communicate()[0]  # what was refused
 
 
-def test_contacts_survive_their_bytes(rng):
+def test_contacts_round_trip_as_bytes(rng):
     points, normals = rng.normal(size=(2, 5, 3))
     normals[0] = -1, 0, 0
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -59,12 +59,12 @@ def test_contacts_survive_their_bytes(rng):
 
 
 @pytest.mark.parametrize("data", [b"", b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 60])
-def test_other_bytes_are_refused_in_one_line(data):
+def test_malformed_bytes_are_refused(data):
     with pytest.raises(ik.errors.InputError, match="PoseArray"):
         decode_contacts(data)
 
 
-def test_messages_are_those_of_ros(rng):
+def test_messages_match_ros_serialisation(rng):
     rosbags = pytest.importorskip("rosbags.typesys")
     store = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
     points, normals = rng.normal(size=(2, 4, 3))
@@ -79,7 +79,7 @@ def test_messages_are_those_of_ros(rng):
 
 
 @pytest.mark.slow
-def test_a_process_asks_and_another_answers(node, rng):
+def test_service_answers_another_process(node, rng):
     """Prints the median of the round trips (`pytest -s`), the decoding of the answer included."""
     config = zenoh.Config()
     config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{node}"]')

@@ -105,7 +105,7 @@ def differences(angles: Array, reference: Array) -> Array:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_an_arm_is_recognised_by_its_axes(name):
+def test_arm_family_is_recognised_from_axes(name):
     assert describe_arm(robot_of(name).description) == KINDS[name]
     assert family(name).is_exact == (name not in MODEL_ERROR and name not in OFFSET)
 
@@ -113,7 +113,7 @@ def test_an_arm_is_recognised_by_its_axes(name):
 @pytest.mark.parametrize(
     "name", ["panda+shadow", "ur5e+shadow", "kuka_lwr4+shadow", "sawyer+shadow", "xarm6+shadow"]
 )
-def test_a_wrist_is_locked_where_there_is_a_family_without_it(name, rng):
+def test_wrist_is_locked_for_families_without_it(name, rng):
     robot = ik.load_robot(name)
     family_arm = arm_family(robot.description)
     assert family_arm is not None
@@ -128,7 +128,7 @@ def test_a_wrist_is_locked_where_there_is_a_family_without_it(name, rng):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_every_arm_brings_the_palm_there_and_one_is_that_it_was_made_with(name):
+def test_solutions_reach_the_palm_and_include_the_generating_arm(name):
     """Random poses and poses near limits.
 
     At the edge of reach one arm of two may be missed by an offset wrist; of a swept one the edge is
@@ -150,7 +150,7 @@ def test_every_arm_brings_the_palm_there_and_one_is_that_it_was_made_with(name):
 @pytest.mark.parametrize(
     ("name", "straight"), [("ur5e", 0.0), ("ur10e", np.pi), ("puma560", 0.0), ("irb140", 0.0)]
 )
-def test_next_to_a_singular_wrist_every_arm_brings_the_palm_there(name, straight):
+def test_solutions_reach_the_palm_near_wrist_singularities(name, straight):
     """However near: what the directions of two short vectors say is not taken for nothing."""
     robot, screws, rng = robot_of(name), family(name).screws, np.random.default_rng(3)
     for power in range(3, 13):
@@ -164,7 +164,7 @@ def test_next_to_a_singular_wrist_every_arm_brings_the_palm_there(name, straight
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_nothing_is_lost_at_singular_poses(name):
+def test_singular_poses_lose_no_solution(name):
     """Wrist aligned, elbow straight, wrist over the shoulder: finite, and the palm still there."""
     screws, rng = arm_screws(robot_of(name).description), np.random.default_rng(2)
     count, error = len(screws), MODEL_ERROR.get(name, 0.0)
@@ -183,7 +183,7 @@ def test_nothing_is_lost_at_singular_poses(name):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_what_is_in_reach_is_never_said_to_be_beyond_and_far_away_nothing_is_in_reach(name):
+def test_reachable_poses_have_zero_distance_and_distant_poses_do_not(name):
     robot, arm = robot_of(name), family(name)
     rotation, origin = ca.SX.sym("rotation", 3, 3), ca.SX.sym("origin", 3)
     lower, upper = (ca.DM(end[: len(arm.screws)]) for end in (robot.lower, robot.upper))
@@ -211,7 +211,7 @@ def moved_screws(screws: Screws, rng: np.random.Generator) -> Screws:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_neither_base_nor_zero_nor_the_names_of_points_matter(name):
+def test_solutions_are_invariant_to_base_zero_and_point_choice(name):
     screws = arm_screws(robot_of(name).description)
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -229,7 +229,7 @@ def test_neither_base_nor_zero_nor_the_names_of_points_matter(name):
             )
 
 
-def test_what_is_nearly_of_a_family_is_solved_as_that_and_what_is_not_is_not():
+def test_small_model_deviations_keep_the_family():
     screws = arm_screws(robot_of("puma560").description)
     for size, is_known in ((5e-4, True), (1e-2, True), (4e-2, False)):
         points = screws.points.copy()
@@ -245,7 +245,7 @@ def test_what_is_nearly_of_a_family_is_solved_as_that_and_what_is_not_is_not():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda", "puma560", "irb140", "ur5e", "xarm6"])
-def test_a_search_from_many_starts_finds_no_other_arm(name):
+def test_numerical_search_finds_no_additional_solution(name):
     """Least squares of SciPy on the product of exponentials, a swept joint held."""
     screws, rng, columns, total = (
         arm_screws(robot_of(name).description),
@@ -276,7 +276,7 @@ def test_a_search_from_many_starts_finds_no_other_arm(name):
 
 
 @pytest.mark.parametrize("name", SOLVED[1:])
-def test_every_arm_of_another_library_is_among_ours(name):
+def test_solutions_include_those_of_eaik(name):
     """EAIK (Ostermeier et al. 2024), by subproblems of its own."""
     eaik = pytest.importorskip("eaik.IK_HP")
     robot, screws = robot_of(name), family(name).screws
@@ -300,7 +300,7 @@ def test_every_arm_of_another_library_is_among_ours(name):
 
 
 @pytest.mark.parametrize("name", OFFSET)
-def test_no_root_of_an_offset_wrist_is_lost(name):
+def test_offset_wrist_search_loses_no_root(name):
     """Against Brent's method between the signs of a scan of 720 turns, branch by branch."""
     robot, family_arm = robot_of(name), family(name)
     assert isinstance(family_arm, OffsetWristArm)
@@ -357,7 +357,7 @@ def at_swivels(robot: ik.ArmHand, palm: Array, swivels: Array) -> Array:
 
 
 @pytest.mark.slow
-def test_an_srs_arm_is_found_again_at_the_swivel_where_a_joint_has_its_value(robot, rng):
+def test_srs_breakpoints_are_where_joints_take_their_value(robot, rng):
     """And where a bound is met at all, a joint stands at it at a breakpoint."""
     numbers_of, tested = srs_numbers(robot), 0
     for q in robot.random(rng, 10):
@@ -376,7 +376,7 @@ def test_an_srs_arm_is_found_again_at_the_swivel_where_a_joint_has_its_value(rob
     assert tested > 20
 
 
-def test_reach_follows_the_bounds_of_an_srs_elbow(robot):
+def test_srs_reach_follows_elbow_bounds(robot):
     arm = srs_arm(robot.description)
     assert arm is not None
     for lower, upper in ((-2.0, 2.0), (0.3, 2.0), (-2.0, -0.4), (0.7, 0.7), (-1e3, 1e3)):
@@ -393,7 +393,7 @@ def test_reach_follows_the_bounds_of_an_srs_elbow(robot):
     turn=st.lists(st.floats(-1.5, 1.5), min_size=3, max_size=3),
     seed=st.integers(0, 2**16),
 )
-def test_srs_arms_with_other_links_and_mounts(heights, shift, turn, seed):
+def test_srs_solutions_with_other_links_and_mounts(heights, shift, turn, seed):
     with tempfile.TemporaryDirectory() as folder:
         robot = derived_robot(Path(folder), heights, (shift, turn))
     rng = np.random.default_rng(seed)
@@ -407,7 +407,7 @@ def test_srs_arms_with_other_links_and_mounts(heights, shift, turn, seed):
     np.testing.assert_allclose(robot.palm(full_q), expected, atol=1e-10)
 
 
-def test_what_is_no_srs_arm_is_not_taken_for_one(tmp_path, own_robot, coupled_robot):
+def test_non_srs_arms_are_not_recognised_as_srs(tmp_path, own_robot, coupled_robot):
     """An elbow off the links, a shoulder apart, a skew axis, no arm at all."""
     (tmp_path / "elbow").mkdir()
     assert srs_arm(derived_robot(tmp_path / "elbow", elbow_offset=0.045).description) is None
@@ -461,7 +461,7 @@ def arm_of(name: str) -> Arm:
 
 
 @pytest.mark.parametrize("name", ["kuka_lwr4", "panda", "kinova_gen3", "xarm7"])
-def test_the_stretches_are_all_that_is_allowed_and_no_more(name):
+def test_branch_intervals_equal_the_allowed_swivels(name):
     """Against a scan of the whole redundancy, a branch at a time."""
     arm, inside_anywhere = arm_of(name), 0
     scan = np.linspace(*arm.range, 700)[1:-1] + 1e-4
@@ -498,7 +498,7 @@ def test_the_stretches_are_all_that_is_allowed_and_no_more(name):
 
 
 @pytest.mark.parametrize("name", ["ur5e", "puma560", "irb140", "xarm6"])
-def test_an_arm_of_six_joints_has_single_branches(name):
+def test_six_joint_arms_have_single_branches(name):
     """The arm that a palm pose was made with, turned by whole turns, is among them."""
     arm = arm_of(name)
     for palm, own_angles in arm.palms(2, 8):

@@ -83,7 +83,7 @@ def wait_for_parts(folder: Path, minimum: int, process: subprocess.Popen[str]) -
 
 @pytest.mark.slow
 @POSIX
-def test_killed_and_taken_up_again(
+def test_killed_batch_resumes(
     targets: Path, unbroken_answers: dict[str, np.ndarray], tmp_path: Path
 ):
     """The client is killed; what it had finished is kept as it is, and the rest is done."""
@@ -115,7 +115,7 @@ def test_killed_and_taken_up_again(
 
 @pytest.mark.slow
 @POSIX
-def test_terminated(targets: Path, tmp_path: Path):
+def test_terminated_batch_resumes(targets: Path, tmp_path: Path):
     """SIGTERM to the client alone: the finished parts stay, its workers do not."""
     out = tmp_path / "out"
     process = begun(targets, *ROBOT, *PARTS, "--resume", "--jobs", "2", "--out", out)
@@ -151,7 +151,7 @@ def cluster() -> Iterator[tuple[str, subprocess.Popen[str], list[subprocess.Pope
 
 @pytest.mark.slow
 @POSIX
-def test_a_cluster_that_loses_a_worker_then_its_scheduler(
+def test_cluster_survives_lost_worker_and_scheduler(
     cluster, targets: Path, unbroken_answers: dict[str, np.ndarray], tmp_path: Path
 ):
     address, scheduler, workers = cluster
@@ -179,7 +179,7 @@ def test_a_cluster_that_loses_a_worker_then_its_scheduler(
     assert_same_arrays(joined_answers, unbroken_answers)
 
 
-def test_a_folder_of_files_and_a_table(
+def test_folder_of_files_and_table_give_the_same_answers(
     targets: Path, robot: ik.ArmHand, unbroken_answers: dict[str, np.ndarray], tmp_path: Path
 ):
     """A Parquet file and an npz file, one after the other."""
@@ -217,7 +217,7 @@ Change = Callable[[Path], list[str]]
         ),
     ],
 )
-def test_what_is_there_must_belong(
+def test_existing_parts_must_match(
     change: Change, says: str, robot: ik.ArmHand, tmp_path: Path, capsys
 ):
     points, normals = robot.contacts(robot.random(np.random.default_rng(4), 20))
@@ -263,7 +263,7 @@ def test_bad_targets(name: str, says: str, tmp_path: Path, capsys):
 
 
 @pytest.mark.parametrize("missing", ["joblib", "polars"])
-def test_an_extra_that_is_missing_leaves_nothing(
+def test_missing_extra_leaves_no_files(
     missing: str, robot: ik.ArmHand, tmp_path: Path, capsys, monkeypatch
 ):
     """It is said before anything is written that would ask for --resume."""
@@ -281,7 +281,7 @@ def test_an_extra_that_is_missing_leaves_nothing(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_answers_are_an_npz_a_table_or_a_folder(
+def test_answers_are_written_as_npz_table_or_folder(
     targets: Path, tmp_path: Path, capsys, unbroken_answers
 ):
     assert main(["batch", str(targets), *ROBOT, "--out", str(tmp_path / "out.csv")]) == 2
@@ -297,9 +297,7 @@ def test_answers_are_an_npz_a_table_or_a_folder(
 @pytest.mark.slow
 @POSIX
 @pytest.mark.parametrize("wait_for", ["out.npz.parts", "out.npz.parts/part-*.npz"])
-def test_terminated_leaves_nothing_half_written(
-    targets: Path, tmp_path: Path, wait_for: str
-) -> None:
+def test_termination_leaves_no_partial_file(targets: Path, tmp_path: Path, wait_for: str) -> None:
     """What is left after SIGTERM are whole parts with their logs; without a part, nothing."""
     out, logs = tmp_path / "out.npz", tmp_path / "logs"
     process = begun(targets, *ROBOT, *PARTS, "--jobs", 2, "--out", out, "--log", logs)

@@ -43,7 +43,7 @@ def point(poses):
     return np.array([np.array(dq.translation(ca.DM(pose))).ravel() for pose in poses])
 
 
-def test_the_described_numbers_give_the_described_robot(ar10, index, rng):
+def test_nominal_parameters_give_the_described_robot(ar10, index, rng):
     q = ar10.random(rng, 20)
     points, normals = ar10.contacts(q)
     poses = index.poses("index", q, index.nominal)
@@ -165,7 +165,7 @@ def test_points_alone_are_enough_for_a_smaller_estimate(index, rng):
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
-def test_few_poses_leave_the_priors_and_the_assumed_noise(count, index):
+def test_few_poses_keep_priors_and_assumed_noise(count, index):
     """No overconfidence: with too few data to show their noise, the assumed one stands."""
     within_bars = []
     for seed in range(20):

@@ -17,7 +17,7 @@ TargetFile = Callable[..., Path]
 ROBOT = ("--robot", "kuka_lwr_barrett")
 
 
-def test_all_solved(
+def test_solved_batch_is_written(
     run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
     out, log = tmp_path / "solved.npz", tmp_path / "solved.mcap"
@@ -42,7 +42,7 @@ def test_all_solved(
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_not_all_solved_names_rows(
+def test_unsolved_rows_are_listed(
     run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
     with np.load(target_file(count=20)) as data:
@@ -57,7 +57,7 @@ def test_not_all_solved_names_rows(
         assert data["success"].tolist() == [True] + [False] * 15 + [True] * 4
 
 
-def test_jobs_and_start_give_what_the_api_gives(
+def test_jobs_and_start_match_the_api(
     run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
     """Whole numbers are numbers, too."""
@@ -91,7 +91,7 @@ def hands(robot: ik.ArmHand, tmp_path: Path) -> Callable[[int], Path]:
 
 
 @pytest.mark.parametrize(("method", "count"), [("hand-first", 60), ("ipopt", 6)])
-def test_blocks_and_jobs_do_not_show(
+def test_results_are_independent_of_blocks_and_jobs(
     run: Command,
     hands: Callable[[int], Path],
     tmp_path: Path,
@@ -117,7 +117,7 @@ def test_blocks_and_jobs_do_not_show(
             np.testing.assert_array_equal(answer[key], value, err_msg=key)
 
 
-def test_diagnoses_are_written_if_asked_for(
+def test_diagnoses_are_written_on_request(
     run: Command, hands: Callable[[int], Path], tmp_path: Path
 ) -> None:
     out = tmp_path / "o.npz"

@@ -39,7 +39,7 @@ def candidates(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_best_are_written(run: Command, candidates: Path, tmp_path: Path) -> None:
+def test_ranking_is_written(run: Command, candidates: Path, tmp_path: Path) -> None:
     out = tmp_path / "ranked.json"
     words = ("choose", candidates, "--robot", ROBOT, *PLACE, "--out", out)
     done = run(*words, "--limit", "3", "--per-candidate", "2").fine()
@@ -65,9 +65,7 @@ def test_the_best_are_written(run: Command, candidates: Path, tmp_path: Path) ->
     assert all(item["solution"]["clearance"] >= 0 for item in json.loads(out.read_text())["ranked"])
 
 
-def test_folders_and_arrays_hold_candidates_too(
-    run: Command, candidates: Path, tmp_path: Path
-) -> None:
+def test_candidates_from_folder_and_arrays(run: Command, candidates: Path, tmp_path: Path) -> None:
     out, folder = tmp_path / "ranked.json", tmp_path / "grasps"
     words = ("--robot", ROBOT, *PLACE, "--limit", "5", "--out", out)
     assert run("choose", candidates, *words).exit == 0
@@ -87,7 +85,7 @@ def test_folders_and_arrays_hold_candidates_too(
         np.testing.assert_allclose(scores_again, scores, atol=1e-9)
 
 
-def test_none_found_counts_the_reasons(run: Command, candidates: Path, tmp_path: Path) -> None:
+def test_failed_choice_counts_reasons(run: Command, candidates: Path, tmp_path: Path) -> None:
     out = tmp_path / "ranked.json"
     far_pose = ("--object-pose", "5", "0", "0", "0", "0", "0")
     done = run("choose", candidates, "--robot", ROBOT, *far_pose, "--out", out)

@@ -196,7 +196,7 @@ def _long(path: Path, robot: ik.ArmHand) -> None:
         ("follow", "frames.npz", _long, 1e-3, "30 s"),
     ],
 )
-def test_what_is_too_large(
+def test_oversized_files_are_refused(
     command: str,
     name: str,
     write: Callable[[Path, ik.ArmHand], None],
@@ -217,7 +217,7 @@ def test_what_is_too_large(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_flag_lets_in(
+def test_limit_option_admits_large_files(
     run: Command, robot: ik.ArmHand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CASADI_IK_LIMITS", "1e-3")

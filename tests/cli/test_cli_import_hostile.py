@@ -64,7 +64,7 @@ ATTACKS = {
         ("classes", "asked"),
     ],
 )
-def test_a_file_runs_no_code_and_reads_no_other(
+def test_files_neither_run_code_nor_read_other_files(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, attack: str, name: str
 ) -> None:
     monkeypatch.setenv("CASADI_IK_SECRET", "hush")
@@ -100,7 +100,7 @@ GROWING = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", GROWING)
-def test_macros_that_grow_without_end(
+def test_exponential_macros_are_refused(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
 ) -> None:
     monkeypatch.setenv("CASADI_IK_LIMITS", "0.1")
@@ -108,7 +108,7 @@ def test_macros_that_grow_without_end(
     assert run("import", path, "--out", "a.yaml").error.startswith(f"{path}: ")
 
 
-def test_macros_are_expanded_where_they_are_asked_for(run: Command, tmp_path: Path) -> None:
+def test_macros_are_expanded_with_the_option(run: Command, tmp_path: Path) -> None:
     pytest.importorskip("pinocchio")
     path, out = robot(tmp_path / "hand.urdf", place="${0.05 * 2}"), tmp_path / "mine.yaml"
     head = '<xacro:property name="unused" value="1"/>'
@@ -132,7 +132,7 @@ HEAD = """<xacro:arg name="side" default="left"/>
 
 
 @pytest.mark.parametrize("lead", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "beside"])
-def test_what_robots_are_written_with_is_expanded(
+def test_standard_xacro_constructs_are_expanded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Command, lead: str
 ) -> None:
     """Properties, arguments, conditions, yaml of the folder, and packages, wherever they are."""
@@ -168,7 +168,7 @@ def test_what_robots_are_written_with_is_expanded(
     assert "more" in imported_robot.links(imported_robot.home)
 
 
-def test_robots_larger_than_any(run: Command, tmp_path: Path) -> None:
+def test_oversized_robots_are_refused(run: Command, tmp_path: Path) -> None:
     path, out = robot(tmp_path / "x.urdf"), tmp_path / "mine.yaml"
     plain, end = path.read_text().removesuffix("</robot>"), tmp_path / "other.yaml"
     ends = '<joint name="j{0}" type="{1}"><parent link="palm"/><child link="x{0}"/>'
@@ -200,7 +200,7 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("case", NUMBERS)
-def test_numbers_and_encodings_of_urdf(run: Command, tmp_path: Path, case: str) -> None:
+def test_urdf_numbers_and_encodings(run: Command, tmp_path: Path, case: str) -> None:
     pytest.importorskip("pinocchio")
     path = robot(tmp_path / "x.urdf")
     old, new, says = NUMBERS[case]
@@ -250,7 +250,7 @@ MODELS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", MODELS)
-def test_numbers_and_giants_of_mjcf(
+def test_mjcf_numbers_and_oversized_models(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
 ) -> None:
     changes, says = MODELS[case]

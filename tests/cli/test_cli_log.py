@@ -50,7 +50,7 @@ def test_solves_events_and_reasons(run_process: Command, run: Command, folder: P
     assert "solved" in run("log", "why", dls, "--solve", "1").fine().out
 
 
-def test_solves_tell_what_was_held(run: Command, robot: ik.ArmHand, tmp_path: Path) -> None:
+def test_solves_list_fixed_actuators(run: Command, robot: ik.ArmHand, tmp_path: Path) -> None:
     log, fixed = tmp_path / "held.mcap", {"lwr_joint_3": 0.2}
     ik.Solver(robot).solve(ik.load_grasp("cup"), log=log, fixed=fixed)
     assert "lwr_joint_3" in run("log", "solves", log).out.split()
@@ -103,7 +103,7 @@ def test_export_of_tables(run: Command, folder: Path, tmp_path: Path) -> None:
     assert set(pl.read_csv(path)["phase"]) == {"hand-alignment"}
 
 
-def test_a_torn_log_is_said_to_be_one(run: Command, folder: Path) -> None:
+def test_torn_log_is_reported(run: Command, folder: Path) -> None:
     done = run("log", "info", folder / "torn" / "torn.mcap")
     assert done.exit == 0
     assert "(casadi-ik log finish)" in " ".join(done.out.split())

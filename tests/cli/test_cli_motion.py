@@ -31,7 +31,7 @@ def write(folder: Path, **arrays: Any) -> Path:
     return file
 
 
-def test_contacts_are_followed_and_others_read_the_motion(
+def test_contacts_are_followed_and_the_motion_is_readable(
     run: Command, tmp_path: Path, robot: ik.ArmHand, path: Any
 ) -> None:
     points, normals = robot.contacts(path)
@@ -87,7 +87,7 @@ def test_keypoints_and_a_bad_frame(run: Command, tmp_path: Path) -> None:
     assert np.isfinite(q).all()
 
 
-def test_world_landmarks_are_said_and_the_period_is_not_smoothed(
+def test_world_landmarks_are_reported_and_period_is_not_smoothed(
     run: Command, tmp_path: Path, robot: ik.ArmHand
 ) -> None:
     frame = hand(0.5, np.zeros(3))
@@ -108,7 +108,7 @@ def test_world_landmarks_are_said_and_the_period_is_not_smoothed(
     assert np.linalg.norm(ends[0] - ends[1], axis=1).max() < 2e-3
 
 
-def test_image_landmarks_are_one_line(run: Command, tmp_path: Path) -> None:
+def test_image_landmarks_are_refused(run: Command, tmp_path: Path) -> None:
     image_frames = np.tile(3.0 * hand(0.5, np.zeros(3)) + [0.3, 0.5, 1e-7], (3, 1, 1))
     frames, out = write(tmp_path, keypoints=image_frames), tmp_path / "motion.mcap"
     done = run("follow", frames, "--robot", "kuka_lwr_barrett", "--out", out)
@@ -144,7 +144,7 @@ def test_the_motion_is_written(run: Command, tmp_path: Path) -> None:
     assert angle.max() <= np.radians(3)
 
 
-def test_a_grasp_that_is_too_far(run: Command, tmp_path: Path) -> None:
+def test_distant_grasp_has_no_motion(run: Command, tmp_path: Path) -> None:
     out = tmp_path / "way.npz"
     done = run("reach", "cup", "--object-pose", "5", "0", "0", "0", "0", "0", "--out", out)
     assert done.exit == 1
@@ -152,7 +152,7 @@ def test_a_grasp_that_is_too_far(run: Command, tmp_path: Path) -> None:
     assert not out.exists()
 
 
-def test_what_was_chosen_is_reached(run: Command, ranked: Path, tmp_path: Path) -> None:
+def test_chosen_grasp_is_reached(run: Command, ranked: Path, tmp_path: Path) -> None:
     """The first of several, or another, by the very posture; with the object in the hand."""
     out, entries = tmp_path / "way.npz", json.loads(ranked.read_text())["ranked"]
     words = ("reach", ranked, "--scene", "table", "--out", out)

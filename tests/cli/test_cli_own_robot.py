@@ -87,7 +87,7 @@ def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.G
     assert "SOLVED" in solved.out
 
 
-def test_the_arm_s_closed_form_is_said_and_its_lack_warned_of(run: Command, tmp_path: Path) -> None:
+def test_closed_form_is_reported_and_its_absence_warned_about(run: Command, tmp_path: Path) -> None:
     path, out = arm(tmp_path), tmp_path / "mine.yaml"
     done = run("import", path, hand(tmp_path), "--out", out).fine()
     assert "spherical wrist" in done.out
@@ -125,7 +125,7 @@ def test_without_shapes_the_pad_is_guessed_from_the_joints(run: Command, tmp_pat
     assert "without shapes" in (tmp_path / "mine.yaml").read_text()
 
 
-def test_options_go_before_guesses(run: Command, tmp_path: Path) -> None:
+def test_options_override_guesses(run: Command, tmp_path: Path) -> None:
     words = ("--tip", "l5", "--palm", "palm", "--mount", "0.01", "0", "-0.02", "0", "0.5", "0")
     out = tmp_path / "mine.yaml"
     assert run("import", arm(tmp_path), hand(tmp_path), *words, "--out", out).exit == 0
@@ -145,7 +145,7 @@ def humanoid(folder: Path, robot: ik.ArmHand) -> Path:
 
 
 @pytest.mark.slow
-def test_a_humanoid_s_trunk_and_sides_are_found(
+def test_trunk_and_sides_of_a_humanoid_are_detected(
     run: Command, tmp_path: Path, rng: np.random.Generator
 ) -> None:
     pytest.importorskip("pinocchio")
@@ -175,7 +175,7 @@ def test_a_humanoid_s_trunk_and_sides_are_found(
 
 
 @pytest.mark.slow
-def test_palms_of_a_body_are_named(run: Command, tmp_path: Path) -> None:
+def test_palms_of_a_body_can_be_named(run: Command, tmp_path: Path) -> None:
     robot = ik.load_robot("g1+dex3")
     path, out = humanoid(tmp_path, robot), tmp_path / "mine.yaml"
     palms = tuple(side.palm_link for side in robot.description.sides)
@@ -209,7 +209,7 @@ def test_joints_without_limits_get_assumed_ones(run: Command, tmp_path: Path) ->
     assert "ff_a" in done.out
 
 
-def test_a_palm_with_arms_for_fingers_is_doubted(run: Command, tmp_path: Path) -> None:
+def test_palm_with_arms_as_fingers_is_warned_about(run: Command, tmp_path: Path) -> None:
     path = arm(tmp_path)
     leg = link("leg") + moves("hip", "base", "leg", "0.1 0 0", "0 1 0", "-1 1")
     path.write_text(path.read_text().replace("</robot>", f"{leg}</robot>"))
@@ -238,7 +238,7 @@ ARM = ("pan", "lift", "elbow", "wrist_flex", "wrist_roll")
         ("wrist_yaw", (6, 0), ("tool",)),
     ],
 )
-def test_a_single_chain_is_an_arm_with_a_jaw_or_a_tool(
+def test_single_chain_is_an_arm_with_jaw_or_tool(
     run: Command, tmp_path: Path, last: str, motors: tuple[int, int], fingers: tuple[str, ...]
 ) -> None:
     path = urdf(tmp_path / "so.urdf", link("base"), chain(tmp_path, (*ARM, last)))
@@ -250,9 +250,7 @@ def test_a_single_chain_is_an_arm_with_a_jaw_or_a_tool(
     assert robot.fingers == fingers
 
 
-def test_the_fixed_jaw_of_a_named_palm_faces_the_one_that_moves(
-    run: Command, tmp_path: Path
-) -> None:
+def test_fixed_jaw_faces_the_moving_jaw(run: Command, tmp_path: Path) -> None:
     def box(at: str, size: str) -> str:
         origin = f'<origin xyz="{at}"/>'
         return f'<collision>{origin}<geometry><box size="{size}"/></geometry></collision>'
@@ -333,7 +331,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_refusals_leave_nothing(
+def test_refused_import_leaves_no_files(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
 ) -> None:
     words, says = REFUSALS[case]
@@ -382,7 +380,7 @@ def gripper(folder: Path) -> Path:
     return path
 
 
-def test_a_relative_file_finds_its_meshes_and_a_propeller_is_no_thumb(
+def test_relative_meshes_are_found_and_a_propeller_is_not_a_thumb(
     run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("pinocchio")
@@ -411,7 +409,7 @@ def test_a_relative_file_finds_its_meshes_and_a_propeller_is_no_thumb(
     assert ik.load_robot("mine.yaml").fingers == robot.fingers[1:]
 
 
-def test_a_missing_package_is_said_once(run: Command, tmp_path: Path) -> None:
+def test_missing_package_is_reported_once(run: Command, tmp_path: Path) -> None:
     path, text = hand(tmp_path), hand(tmp_path).read_text()
     for name in ("ff_1", "mf_1", "opposed_1"):
         mesh = f'<mesh filename="package://shapes_of_it/meshes/{name}.stl"/>'

@@ -236,7 +236,7 @@ def test_one_line_and_nothing_written(
     assert sorted(place.rglob("*")) == files_before
 
 
-def test_a_refusal_of_a_process(run_process: Command, place: Path) -> None:
+def test_process_reports_refusal(run_process: Command, place: Path) -> None:
     assert "log.mcap: solve 99 " in run_process("log", "why", place / "log.mcap", 99).error
 
 
@@ -259,7 +259,7 @@ def _changed(array: np.ndarray, index: Any, value: float) -> np.ndarray:
         ),
     ],
 )
-def test_bad_rows_are_named_and_do_not_stop_the_rest(
+def test_bad_rows_are_named_and_the_others_solved(
     change: Callable[..., Any],
     fault: str,
     run: Command,
@@ -315,7 +315,7 @@ RANKED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
 
 
 @pytest.mark.parametrize("case", RANKED)
-def test_what_ranked_files_are_refused(
+def test_bad_ranked_files_are_refused(
     case: str, run: Command, ranked: Path, place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     change, says = RANKED[case]

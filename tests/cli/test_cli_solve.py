@@ -49,7 +49,7 @@ def test_solved_grasp(
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), errors, atol=1e-12)
 
 
-def test_the_same_as_the_api(
+def test_answers_match_the_api(
     run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
     path, out = grasp_file(), tmp_path / "pinch.json"
@@ -62,7 +62,7 @@ def test_the_same_as_the_api(
     assert report["iterations"] == solution.iterations
 
 
-def test_what_may_be_said(
+def test_solve_options_are_accepted(
     run: Command, grasp_file: GraspFile, own_robot: Path, tmp_path: Path
 ) -> None:
     """Numbers with commas and spaces, other tolerances, the paper's step, a robot of one's own."""
@@ -91,7 +91,7 @@ def test_fixed_actuators_stay(run: Command, grasp_file: GraspFile, tmp_path: Pat
     assert "'enhanced-dls'" in refused
 
 
-def test_not_solved_says_why(run: Command, far_away: Path, tmp_path: Path) -> None:
+def test_unsolved_grasp_is_explained(run: Command, far_away: Path, tmp_path: Path) -> None:
     out = tmp_path / "far.json"
     done = run("solve", far_away, *FAST, "--out", out)
     assert (done.exit, done.err) == (1, "")
@@ -138,7 +138,7 @@ def test_picture_is_drawn(run: Command, grasp_file: GraspFile, tmp_path: Path) -
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_a_picture_lacks_is_found_first(
+def test_missing_picture_libraries_are_reported_before_solving(
     run: Command, grasp_file: GraspFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ik.Solver, "solve", None)
@@ -217,7 +217,7 @@ def test_contacts_go_with_the_object(
 
 
 @pytest.mark.filterwarnings("default:q0")
-def test_effort_is_limited_and_degrees_are_noticed(run: Command, robot: ik.ArmHand) -> None:
+def test_effort_is_limited_and_degrees_are_detected(run: Command, robot: ik.ArmHand) -> None:
     degrees = [f"{value:g}" for value in np.rad2deg(robot.home)]
     done = run("solve", "cup", "--q0", *degrees, "--max-rounds", "1")
     assert done.exit == 0
@@ -254,14 +254,14 @@ def test_units(run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path:
     assert in_mm == pytest.approx(json.loads(out.read_text())["q"], abs=1e-9)
 
 
-def test_the_report_and_the_file_state_the_same_time(run: Command, tmp_path: Path) -> None:
+def test_report_and_file_state_the_same_time(run: Command, tmp_path: Path) -> None:
     out = tmp_path / "o.json"
     done = run("solve", "cup", "--out", out)
     seconds = json.loads(out.read_text())["time"]
     assert f"{seconds * 1e6:.3g} us" in done.out or f"{seconds * 1e3:.3g} ms" in done.out
 
 
-def test_without_a_scene_an_object_in_the_hand_is_said(run: Command, tmp_path: Path) -> None:
+def test_overlapping_object_is_reported_without_a_scene(run: Command, tmp_path: Path) -> None:
     shipped = Path(__file__).parents[2] / "models" / "grasps" / "cup.yaml"
     text = shipped.read_text(encoding="utf-8")
     assert "0.126889040887" in text

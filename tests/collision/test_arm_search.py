@@ -66,9 +66,7 @@ def scores(search, hands, arms, prefer):
 
 @pytest.mark.parametrize("branches", [False, True])
 @pytest.mark.parametrize("prefer", PREFERENCES)
-def test_without_a_compiler_the_same_hands_have_arms_no_better(
-    search, plain, robot, hands, prefer, branches
-):
+def test_compiled_search_is_no_worse_than_numpy(search, plain, robot, hands, prefer, branches):
     """It looks at the same values and those between, and no closer."""
     compiled, simple = (
         run_search(arm_search, robot, hands, prefer, branches) for arm_search in (search, plain)
@@ -90,7 +88,7 @@ def test_without_a_compiler_the_same_hands_have_arms_no_better(
         assert np.mean(better >= -1e-9) > 0.7
 
 
-def test_a_preference_of_ones_own_is_asked_by_the_compiled_search(search, robot, hands):
+def test_compiled_search_uses_custom_preferences(search, robot, hands):
     """And its error comes through."""
 
     def high(q):
@@ -109,7 +107,7 @@ def test_a_preference_of_ones_own_is_asked_by_the_compiled_search(search, robot,
         run_search(search, robot, hands, broken)
 
 
-def test_what_is_chosen_is_the_best_free_arm(search, robot, hands):
+def test_best_collision_free_arm_is_chosen(search, robot, hands):
     """Any free arm of the same hand found by other means is no farther from its limits."""
     q, _, around, _ = hands
     arms = run_search(search, robot, hands, "limits")
@@ -122,7 +120,7 @@ def test_what_is_chosen_is_the_best_free_arm(search, robot, hands):
     assert is_free.sum() > 5
 
 
-def test_each_hand_is_looked_at_alone(search, robot, hands):
+def test_hands_are_searched_independently(search, robot, hands):
     all_arms, rows = run_search(search, robot, hands, "limits"), np.array([7, 3, 11])
     q, starts, around, clearance = hands
     arms_of_rows = run_search(
@@ -134,7 +132,7 @@ def test_each_hand_is_looked_at_alone(search, robot, hands):
         )
 
 
-def test_the_first_hand_of_a_target_with_an_arm_is_enough(search, plain, robot, hands):
+def test_search_stops_at_the_first_hand_with_an_arm(search, plain, robot, hands):
     whose = np.arange(len(hands[0])) // 3
     all_arms = run_search(search, robot, hands, "limits")
     targets = whose[all_arms.hand_index]
@@ -145,7 +143,7 @@ def test_the_first_hand_of_a_target_with_an_arm_is_enough(search, plain, robot, 
         assert (arms.arms_tried[firsts] > 0).all()
 
 
-def test_only_motors_of_unconstrained_fingers_move_and_only_for_more_room():
+def test_only_unconstrained_fingers_move_to_gain_clearance():
     robot = ik.load_robot("panda+shadow")
     rng, idle = np.random.default_rng(2), [robot.fingers.index(name) for name in ("ring", "little")]
     q = robot.random(rng, 120)

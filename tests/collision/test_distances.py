@@ -46,7 +46,7 @@ def by_coal(robot: ik.ArmHand, q: np.ndarray, names: set[frozenset[str]]) -> np.
     return distances
 
 
-def test_distances_are_those_of_coal_and_never_larger(robot, rng):
+def test_distances_match_coal_and_are_conservative(robot, rng):
     around = surroundings(robot, ik.Scene(SCENE))
     q = robot.random(rng, 300)
     names = [frozenset(pair) for pair in around.table.names]
@@ -73,7 +73,7 @@ def test_distances_are_those_of_coal_and_never_larger(robot, rng):
             )
 
 
-def test_planes_round_a_hull_off_by_little(robot, rng):
+def test_hull_planes_round_off_little(robot, rng):
     around = surroundings(robot, ik.Scene({"block": SCENE["block"]}))
     q = robot.random(rng, 200)
     rows = np.array([{"l3", "block"} == set(pair) for pair in around.table.names])
@@ -84,7 +84,7 @@ def test_planes_round_a_hull_off_by_little(robot, rng):
     assert (coals - ours)[is_near].max() < 0.02 * 0.24
 
 
-def test_the_virtual_machine_gives_the_same(robot, rng):
+def test_virtual_machine_gives_the_same_distances(robot, rng):
     compiled = surroundings(robot, ik.Scene(SCENE))
     plain = surroundings(robot, ik.Scene(SCENE), compiled=False)
     q = robot.random(rng, 100)
@@ -101,7 +101,7 @@ def test_the_virtual_machine_gives_the_same(robot, rng):
 
 
 @pytest.mark.parametrize("name", ["three", "ar10"])
-def test_shapes_come_no_nearer_than_by_steps_times_levers(robot, rng, name):
+def test_distances_change_at_most_by_the_displacement_bound(robot, rng, name):
     """Joints that turn, slide, and follow sliders over linkages."""
     robot, scene = (
         (robot, ik.Scene(SCENE)) if name == "three" else (ik.load_robot(name), ik.Scene())

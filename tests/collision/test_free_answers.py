@@ -16,7 +16,7 @@ def solver(robot) -> ik.Solver:
 
 
 @pytest.mark.parametrize("name", ik.shipped_grasps("kuka_lwr_barrett"))
-def test_shipped_grasps_have_free_answers_on_the_table(solver, robot, name):
+def test_shipped_grasps_have_collision_free_solutions_on_a_table(solver, robot, name):
     grasp = ik.load_grasp(name)
     solution = solver.solve(grasp)
     assert solution.status is ik.Status.SOLVED, solution.collision
@@ -29,7 +29,7 @@ def test_shipped_grasps_have_free_answers_on_the_table(solver, robot, name):
     assert (angle <= np.deg2rad(3)).all()
 
 
-def test_the_choice_finds_what_contacts_alone_miss(solver, robot):
+def test_choice_finds_candidates_that_contacts_alone_miss(solver, robot):
     """Without a choice some of these answers touch something; with it none does."""
     grasps = [ik.load_grasp(name) for name in ik.shipped_grasps(robot.name)]
     blind = ik.Solver(robot)
@@ -41,7 +41,7 @@ def test_the_choice_finds_what_contacts_alone_miss(solver, robot):
     assert touching >= 3
 
 
-def test_a_wall_in_the_way_is_named(robot):
+def test_blocking_wall_is_named(robot):
     cup = ik.load_grasp("cup")
     wall = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3].tolist()}
     solver = ik.Solver(robot, scene=ik.Scene({"balloon": wall}))
@@ -61,7 +61,7 @@ def test_a_wall_in_the_way_is_named(robot):
     assert any("balloon" in line for line in report.lines)
 
 
-def test_no_scene_checks_nothing(robot):
+def test_without_a_scene_no_collision_is_checked(robot):
     solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
     assert solution.clearance is None
     assert solution.closest is None
@@ -69,7 +69,7 @@ def test_no_scene_checks_nothing(robot):
         ik.Solver(robot).solve(ik.load_grasp("cup"), prefer="clearance")
 
 
-def test_what_is_grasped_may_be_touched_by_the_fingers_alone(solver):
+def test_grasped_object_may_only_touch_the_fingers(solver):
     cup = ik.load_grasp("cup")
     around = solver._engine.collision_query(solver._request.of_grasps([cup], None))
     of_cup = {names[0] for names in around.table.names if names[1] == "cup"}
@@ -90,7 +90,7 @@ def test_clearance_is_preferred_if_asked(solver):
     assert max(gained) > 1e-3
 
 
-def test_batches_are_what_single_solves_are(solver, robot):
+def test_batches_match_single_solves(solver, robot):
     grasps = [ik.load_grasp(name) for name in ("cup", "mug", "banana")]
     arrays = [grasp.arrays(robot.fingers) for grasp in grasps]
     points, normals = (np.stack(parts) for parts in zip(*arrays, strict=True))
@@ -112,7 +112,7 @@ def test_batches_are_what_single_solves_are(solver, robot):
         solver.solve_batch(points, normals, object_pose=poses)
 
 
-def test_poses_for_other_rows_are_refused(solver):
+def test_wrong_number_of_object_poses_is_refused(solver):
     """The driver reads as many poses as there are configurations."""
     cup = ik.load_grasp("cup")
     around = solver._engine.collision_query(solver._request.of_grasps([cup, cup], None))
@@ -121,7 +121,7 @@ def test_poses_for_other_rows_are_refused(solver):
     assert around.check(np.tile(solver.robot.home, (2, 1))).free.shape == (2,)
 
 
-def test_all_solutions_are_free(solver):
+def test_all_solutions_are_collision_free(solver):
     cup = ik.load_grasp("cup")
     solutions = solver.solve_all(cup, limit=4)
     assert solutions
@@ -129,12 +129,12 @@ def test_all_solutions_are_free(solver):
     assert around.free(np.stack([solution.q for solution in solutions])).all()
 
 
-def test_what_knows_no_scene_says_so(solver):
+def test_calls_without_scene_support_say_so(solver):
     with pytest.raises(ik.errors.UnsupportedError, match=r"fast: .*scene"):
         solver.fast()
 
 
-def test_other_methods_are_checked_at_the_end(robot):
+def test_other_methods_are_checked_after_the_solve(robot):
     cup = ik.load_grasp("cup")
     wall = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3].tolist()}
     scene = ik.Scene({"balloon": wall})
@@ -145,13 +145,13 @@ def test_other_methods_are_checked_at_the_end(robot):
     assert paper_solution.clearance < 0
 
 
-def test_a_solver_with_a_scene_can_be_copied(solver):
+def test_solver_with_scene_can_be_copied(solver):
     copy = pickle.loads(pickle.dumps(solver))
     grasp = ik.load_grasp("cup")
     np.testing.assert_array_equal(copy.solve(grasp).q, solver.solve(grasp).q)
 
 
-def test_an_answer_is_its_targets_own(solver, robot):
+def test_rows_have_independent_answers(solver, robot):
     """Whatever targets are solved with it: bit for bit, those included that have none."""
     rng = np.random.default_rng(4)
     points, normals = robot.contacts(robot.random(rng, 40))

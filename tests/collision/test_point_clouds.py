@@ -60,7 +60,7 @@ def by_hand(robot: ik.ArmHand, points: np.ndarray, q: np.ndarray) -> np.ndarray:
     return clearance
 
 
-def test_thousands_of_points_are_as_far_as_by_hand(robot, rng):
+def test_cloud_distances_match_numpy(robot, rng):
     points = surfaces(rng, 5000)
     q = robot.random(rng, 150)
     itself = clearances(robot, ik.Scene(), q)
@@ -69,7 +69,7 @@ def test_thousands_of_points_are_as_far_as_by_hand(robot, rng):
     np.testing.assert_allclose(clearances(robot, cloud(points), q), expected, atol=1e-9)
 
 
-def test_a_cloud_is_its_balls_one_by_one(robot, rng):
+def test_cloud_equals_its_balls(robot, rng):
     points = surfaces(rng, 70)
     balls = {
         str(i): {"kind": "sphere", "radius": RADIUS, "xyz": point} for i, point in enumerate(points)
@@ -102,7 +102,7 @@ def test_a_cloud_is_its_balls_one_by_one(robot, rng):
                 )
 
 
-def test_numpy_says_the_same(robot, rng):
+def test_numpy_fallback_gives_the_same_clearance(robot, rng):
     scene = cloud(surfaces(rng, 2500), xyz=[0, 0, 0.05], rpy=[0.1, 0.2, 0.3])
     q = robot.random(rng, 40)
     compiled_clearance, numpy_clearance = (
@@ -111,7 +111,7 @@ def test_numpy_says_the_same(robot, rng):
     np.testing.assert_allclose(compiled_clearance, numpy_clearance, atol=3e-7)
 
 
-def test_what_is_thinned_is_never_farther(robot, rng):
+def test_thinned_clouds_are_conservative(robot, rng):
     points = surfaces(rng, 4000)
     q = robot.random(rng, 80)
     full, thin = (clearances(robot, cloud(points, voxel=edge), q) for edge in (0.0, 0.03))
@@ -207,7 +207,7 @@ def pack_lzf(data: bytes) -> bytes:
     return bytes(packed)
 
 
-def test_every_file_gives_the_same_points(robot, rng, tmp_path):
+def test_file_formats_give_the_same_points(robot, rng, tmp_path):
     points = surfaces(rng, 100)
     holed = np.insert(points, 3, np.nan, axis=0)  # as cameras write what they do not see
     q = robot.random(rng, 20)
@@ -253,7 +253,7 @@ PACKED = HEAD + b"DATA binary_compressed\n"
         ("a.las", b"", "expected a name that ends in .npy, .npz, .ply, .pcd, .xyz, .txt, .csv"),
     ],
 )  # fmt: skip
-def test_files_that_are_none_are_one_line(tmp_path, name, data, message):
+def test_malformed_cloud_files_are_refused(tmp_path, name, data, message):
     (tmp_path / name).write_bytes(data)
     entry = {"kind": "point-cloud", "radius": 0.01, "file": str(tmp_path / name)}
     with pytest.raises(errors.DescriptionError, match=message) as caught:
@@ -262,7 +262,7 @@ def test_files_that_are_none_are_one_line(tmp_path, name, data, message):
     assert "solids.seen" in str(caught.value)
 
 
-def test_arrays_and_keys_that_do_not_fit(tmp_path):
+def test_bad_cloud_arrays_and_keys_are_refused(tmp_path):
     with (
         zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive,
         archive.open("points.npy", "w", force_zip64=True) as stream,
@@ -289,7 +289,7 @@ def test_arrays_and_keys_that_do_not_fit(tmp_path):
         assert str(caught.value).startswith("scene: solids.seen")
 
 
-def test_answers_keep_off_a_cloud(rng):
+def test_solutions_keep_clear_of_a_cloud(rng):
     """A grasp in a scene that is a cloud alone: free, and why it is not where there is no way."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     bare = ik.Solver(robot, scene=ik.Scene()).solve(grasp)
@@ -313,7 +313,7 @@ def test_answers_keep_off_a_cloud(rng):
     assert "seen" in blocked.closest
 
 
-def test_poses_are_said_in_four_ways(robot, rng, tmp_path):
+def test_pose_formats_are_equivalent(robot, rng, tmp_path):
     rpy = [0.4, -0.3, 1.1]
     (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a / 2), np.sin(a / 2)) for a in rpy)
     w = cr * cp * cy + sr * sp * sy
@@ -351,7 +351,7 @@ def test_poses_are_said_in_four_ways(robot, rng, tmp_path):
         ({"pose": np.eye(3)}, "pose"),
     ],
 )
-def test_poses_that_are_none(pose_keys, message):
+def test_malformed_poses_are_refused(pose_keys, message):
     with pytest.raises(errors.DescriptionError, match=message) as caught:
         ik.Scene({"a": {"kind": "box", "size": [1, 1, 1], **pose_keys}})
     assert str(caught.value).startswith("scene: solids.a")

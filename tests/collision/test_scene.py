@@ -46,7 +46,7 @@ def test_an_empty_mesh_is_refused(tmp_path):
         ik.Scene({"a": {"kind": "mesh", "file": str(path)}})
 
 
-def test_what_is_grasped_has_to_be_there():
+def test_grasped_object_must_exist():
     with pytest.raises(DescriptionError, match=r"grasped:.*'cup'"):
         ik.Scene({"a": BOX}, grasped="cup")
     with pytest.raises(DescriptionError, match=r"margin:.*-1.*>= 0"):
@@ -59,14 +59,14 @@ def test_shipped_and_unknown_scenes():
         ik.load_scene("moon")
 
 
-def test_a_file_says_where(tmp_path):
+def test_scene_errors_name_the_file(tmp_path):
     path = tmp_path / "scene.yaml"
     path.write_text("solids:\n  a: {kind: box, size: [1 m, 1 m, 1 deg]}\n")
     with pytest.raises(DescriptionError, match=r"scene.yaml: solids.a.size\[2\]: found '1 deg'"):
         ik.load_scene(path)
 
 
-def test_moving_leaves_the_first_scene_alone():
+def test_moving_an_object_copies_the_scene():
     scene = ik.Scene({"a": BOX}, margin=0.01)
     pose = np.eye(4)
     pose[:3, 3] = [1, 2, 3]
@@ -80,7 +80,7 @@ def test_moving_leaves_the_first_scene_alone():
         scene.moved("a", np.ones((4, 4)))
 
 
-def test_nothing_may_stand_in_the_base(tmp_path):
+def test_obstacles_at_the_base_are_refused(tmp_path):
     robot = ik.load_robot(write_robot(tmp_path))
     post_in_base = {"post": {"kind": "box", "size": [0.1, 0.1, 0.1], "xyz": [0, 0, 0.1]}}
     with pytest.raises(DescriptionError, match=r"solids.post:.*'base'"):

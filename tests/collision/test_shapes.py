@@ -156,7 +156,7 @@ def test_bad_shapes_are_named(tmp_path, place, value, message):
     assert "three.yaml" in str(caught.value) or "none.srdf" in str(caught.value)
 
 
-def test_an_srdf_says_what_may_touch(tmp_path):
+def test_srdf_exceptions_are_read(tmp_path):
     path = write_robot(tmp_path)
     arm = copy.deepcopy(ARM)
     arm["collision"]["srdf"] = "three.srdf"
@@ -169,7 +169,7 @@ def test_an_srdf_says_what_may_touch(tmp_path):
     assert ("base", "l3", "three.srdf: Never") in [(*pair.links, pair.reason) for pair in excluded]
 
 
-def test_a_robot_without_shapes_works_but_takes_no_scene(tmp_path):
+def test_robot_without_shapes_takes_no_scene(tmp_path):
     path = write_robot(tmp_path)
     arm = {key: value for key, value in ARM.items() if key != "collision"}
     (tmp_path / "three.yaml").write_text(yaml.safe_dump(arm))
@@ -193,7 +193,7 @@ def test_a_robot_without_shapes_works_but_takes_no_scene(tmp_path):
         "ar10",
     ],
 )
-def test_shipped_robots_stand_free_at_home(name):
+def test_shipped_robots_are_collision_free_at_home(name):
     """At home no two links touch that are checked: the shapes are not too large to be of use."""
     robot = ik.load_robot(name)
     check = SceneCheck(robot, ik.Scene(), compiled=False)
@@ -216,7 +216,7 @@ def test_shipped_robots_stand_free_at_home(name):
         ("sawyer", "sawyer_link_1", [-67.9, 2.9, 1.0]),
     ],
 )
-def test_shapes_hold_what_is_seen_of_an_arm(arm, link, corner):
+def test_shapes_enclose_the_visible_arm(arm, link, corner):
     """The corners that stood out the most of shapes fitted to what is there for collisions."""
     shapes = ik.load_robot(f"{arm}+barrett_bh8_280").description.shapes
     point = np.array(corner) / 1e3
@@ -233,7 +233,7 @@ def test_shapes_hold_what_is_seen_of_an_arm(arm, link, corner):
     assert min(separations) < 1e-4
 
 
-def test_a_description_reads_simple_shapes_of_its_file(tmp_path: Path) -> None:
+def test_simple_shapes_are_read_from_the_description(tmp_path: Path) -> None:
     write_hand(tmp_path)
     path = tmp_path / "mine.yaml"
     path.write_text(DESCRIPTION)
@@ -258,7 +258,7 @@ def test_a_description_reads_simple_shapes_of_its_file(tmp_path: Path) -> None:
     assert [solid.radius for solid in palm] == [0.05]
 
 
-def test_meshes_that_nobody_fitted_are_no_shapes(tmp_path: Path, rng) -> None:
+def test_unfitted_meshes_are_not_shapes(tmp_path: Path, rng) -> None:
     write_mesh(tmp_path, rng)
     write_hand(tmp_path, '<mesh filename="slab.stl"/>')
     path = tmp_path / "mine.yaml"
@@ -269,7 +269,7 @@ def test_meshes_that_nobody_fitted_are_no_shapes(tmp_path: Path, rng) -> None:
         collision_model(robots.load_description(path))
 
 
-def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
+def test_imported_shapes_enclose_the_meshes(tmp_path: Path, rng) -> None:
     points = write_mesh(tmp_path, rng)
     hand = write_hand(tmp_path, '<mesh filename="slab.stl"/>')
     (tmp_path / "hand.srdf").write_text(
@@ -319,7 +319,7 @@ def test_import_writes_shapes_that_hold_the_meshes(tmp_path: Path, rng) -> None:
     assert SceneCheck(ik.ArmHand(description), ik.Scene(), compiled=False).model.pairs.size
 
 
-def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+def test_written_shapes_round_trip(tmp_path: Path) -> None:
     """Shapes come back from the YAML as they were."""
     shapes = {
         "a link": [
@@ -335,7 +335,7 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert len(capsules_of(entry.links["b"][0])) == 1
 
 
-def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
+def test_capsule_overhang_is_bounded_from_few_points():
     """The same as every sample against every point, and every corner held."""
     rng = np.random.default_rng(0)
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -357,7 +357,7 @@ def test_how_far_capsules_stand_out_is_found_by_looking_at_few_points():
     assert len(fitted) > 1
 
 
-def test_a_fine_mesh_is_simplified_by_less_than_a_cell_and_enclosed_as_a_whole():
+def test_fine_mesh_is_simplified_within_a_cell_and_enclosed():
     ball = trimesh.creation.icosphere(5, 0.02)
     mesh = IndexedMesh(np.asarray(ball.vertices) * [1, 1, 2], np.asarray(ball.faces))
     coarse = mesh.simplified(3000, 40)

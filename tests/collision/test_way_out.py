@@ -11,7 +11,7 @@ import casadi_ik as ik
 from casadi_ik.collision.distances import gaps
 
 
-def test_what_is_said_to_help_does(robot) -> None:
+def test_suggested_remedies_work(robot) -> None:
     """A ball over the cup: it is said how far the cup has to go, and there it has an answer."""
     cup = ik.load_grasp("cup")
     ball = {"kind": "sphere", "radius": 0.16, "xyz": (cup.object_pose[:3, 3] + [0.1, 0, 0.2])}

@@ -69,7 +69,7 @@ def test_conventions_agree_with_the_published_hands(name: str) -> None:
         assert ours[:3, 3] == pytest.approx(place, abs=within), theirs
 
 
-def test_a_palm_is_where_it_is_asked(tmp_path: Path) -> None:
+def test_palm_poses_are_reached(tmp_path: Path) -> None:
     """`solve`, `solve_all`, `choose` and YAML take a palm and a posture as given."""
     robot = ik.load_robot(KUKA)
     solver = ik.Solver(robot)
@@ -239,7 +239,7 @@ def test_columns_that_are_not_joints(suffix: str, tmp_path: Path) -> None:
         ik.load_candidates(path, KUKA)
 
 
-def test_files_of_dro_are_told_from_multidex(tmp_path: Path) -> None:
+def test_dro_files_are_distinguished_from_multidex(tmp_path: Path) -> None:
     """Their rotations are three angles; read as columns of a matrix, hands would stand anywhere."""
     row = np.zeros(6 + 8)
     counts = {"num_total": 1, "num_upper_object": 1, "num_per_object": {"contactdb+apple": 1}}
@@ -291,7 +291,7 @@ def test_bad_data_sets(content: Any, says: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_another_hand(tmp_path: Path) -> None:
+def test_data_of_another_robot_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "set.npy"
     np.save(path, np.array(_getagrip(), dtype=object))
     with pytest.raises(ik.errors.UnsupportedError, match="getagrip:"):
@@ -324,7 +324,7 @@ def _tips(robot: ik.ArmHand, grasp: ik.Grasp, postures: np.ndarray) -> np.ndarra
     return (robot.contacts(q)[0] - palms[:, None, :3, 3]) @ palms[:, :3, :3]
 
 
-def test_joints_that_are_free_in_the_data(tmp_path: Path) -> None:
+def test_free_joints_of_a_data_set(tmp_path: Path) -> None:
     """Distal joints of the Shadow hand follow the middle ones; no posture's tips are nearer."""
     written = _dexgraspnet(tmp_path)
     robot, rng = written.robot, np.random.default_rng(2)
@@ -399,7 +399,7 @@ def test_rows_beyond_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert "1 of 2 rows" in capsys.readouterr().out
 
 
-def test_rows_that_are_no_grasps(tmp_path: Path) -> None:
+def test_invalid_rows_can_be_dropped(tmp_path: Path) -> None:
     """NaN, millimetres, no rotation, or no pad at the object: such rows can be left out."""
     arrays, robot = _getagrip(), ik.load_robot("panda+allegro_right")
     wrong = {name: np.repeat(array, 3, axis=0) for name, array in arrays.items()}
@@ -422,7 +422,7 @@ def test_rows_that_are_no_grasps(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["bodex_allegro", "dexgraspbench_leap"])
-def test_stages_before_and_after(name: str, tmp_path: Path) -> None:
+def test_pregrasp_and_squeeze_stages(name: str, tmp_path: Path) -> None:
     """Pregrasp and squeeze stay with the candidate and move with it."""
     written = made(name, tmp_path)
     place = np.eye(4)
@@ -472,7 +472,7 @@ class _Runs:
         lambda flag: _Runs(getattr, "a", "upper"),
     ],
 )
-def test_nothing_in_a_pickle_is_run(build: Any, tmp_path: Path) -> None:
+def test_pickles_execute_nothing(build: Any, tmp_path: Path) -> None:
     path, flag = tmp_path / "set.npy", tmp_path / "flag"
     np.save(path, np.array(_getagrip(trans=build(flag)), dtype=object), allow_pickle=True)
     with pytest.raises(ik.errors.DescriptionError, match=r"set\.npy:"):

@@ -50,7 +50,7 @@ def _grasp_file(folder: Path, thumb_at: np.ndarray) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["obj", "stl", "ply"])
-def test_distances_are_those_of_the_body(kind: str, tmp_path: Path) -> None:
+def test_mesh_distances_match_the_solid(kind: str, tmp_path: Path) -> None:
     """Two boxes that touch are one: what is between them is inside; a hole is outside."""
     halves = [_box((0.1, 0.12, 0.08), (side * 0.05, 0.0, 0.0)) for side in (-1, 1)]
     body = grasps.load_object(
@@ -87,7 +87,7 @@ def test_pads_touch_the_mesh(tmp_path: Path) -> None:
         ik.load_candidates(within, ROBOT, take="contacts", grasped=mesh)
 
 
-def test_a_mesh_is_as_large_as_the_data_say(tmp_path: Path) -> None:
+def test_mesh_takes_the_scale_of_the_data(tmp_path: Path) -> None:
     written = made("bodex_allegro", tmp_path)  # obj_scale 0.06
     ball: Any = trimesh.creation.icosphere(3, 1.0)
     ball.export(tmp_path / "ball.obj")
@@ -154,7 +154,7 @@ def test_an_object_file_with_a_mesh(tmp_path: Path) -> None:
         grasps.load_object(f"{tmp_path / 'handle.obj'}@two")
 
 
-def test_a_flat_part_is_thin_and_a_flat_mesh_is_refused(tmp_path: Path) -> None:
+def test_flat_part_is_thin_and_flat_mesh_is_refused(tmp_path: Path) -> None:
     sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]])
     two_parts, sheet_file = _written(tmp_path / "a.stl", [*_arch(), sheet]), tmp_path / "b.stl"
     scene = ik.Scene({"a": {"kind": "mesh", "file": str(two_parts), "parts": True}})

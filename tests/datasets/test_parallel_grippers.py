@@ -91,7 +91,7 @@ def test_pads_are_where_the_grasp_has_them(name: str, layout: str, tmp_path: Pat
             assert np.asarray(grasp.palm)[:3, 2] == pytest.approx(frame[:3, 2], abs=1e-6)
 
 
-def test_an_arm_reaches_them(tmp_path: Path) -> None:
+def test_arm_reaches_gripper_grasps(tmp_path: Path) -> None:
     robot = ik.load_robot("panda+panda_hand")
     frames = np.tile(np.diag([1.0, -1.0, -1.0, 1.0]), (COUNT, 1, 1))
     frames[:, :3, 3] = np.linspace([0.35, -0.2, 0.1], [0.5, 0.2, 0.2], COUNT)
@@ -103,7 +103,7 @@ def test_an_arm_reaches_them(tmp_path: Path) -> None:
     assert points.mean(axis=0) == pytest.approx(tip, abs=6e-3)
 
 
-def test_what_a_gripper_cannot_take(tmp_path: Path) -> None:
+def test_unsuitable_gripper_data_are_refused(tmp_path: Path) -> None:
     frames, widths = grasp_frames(np.random.default_rng(0)), np.full(COUNT, 0.05)
     widths[1] = 0.12
     path = write("poses.npz", tmp_path, frames, widths)

@@ -15,7 +15,7 @@ import casadi_ik as ik
 from casadi_ik.integrations.datasets.unpickling import read_torch
 
 
-def test_a_file_that_torch_wrote() -> None:
+def test_torch_file_is_read() -> None:
     """By torch 2.13: strides, kinds of numbers, empty and single ones; grasps of two objects."""
     path = Path(__file__).parent / "written_by_torch.pt"
     content = read_torch(path)

@@ -16,14 +16,14 @@ def rows(title: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-def test_a_solve_goes_through_eight_files_at_most() -> None:
+def test_solve_spans_at_most_eight_files() -> None:
     files = [re.sub("`", "", row[0]) for row in rows("How a target is processed")]
     assert 1 < len(files) <= 8
     for file in files:
         assert (ROOT / file).is_file(), file
 
 
-def test_an_addition_takes_the_files_that_are_named() -> None:
+def test_additions_take_the_named_files() -> None:
     additions = rows("Adding to it")
     assert len(additions) >= 9
     for kind, max_files, files, _ in additions:

@@ -27,7 +27,7 @@ def test_broken_links_are_named(tmp_path: Path) -> None:
     ]
 
 
-def test_what_stands_as_it_was_written_is_named(tmp_path: Path) -> None:
+def test_unrendered_markup_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.html").write_text(
         "<p>| solves | share |\n| --- | --- |\n| 12 | 67 % |</p><p>of $H_p$ alone</p>"
         "<pre>| --- | $H_p$</pre><p>5 $ and no more</p><p><code>$x$</code></p>"
@@ -38,7 +38,7 @@ def test_what_stands_as_it_was_written_is_named(tmp_path: Path) -> None:
     ]
 
 
-def test_the_script_ends_with_what_it_found(tmp_path: Path) -> None:
+def test_script_exits_with_its_findings(tmp_path: Path) -> None:
     page = tmp_path / "a.html"
     page.write_text('<p id="top"></p><a href="#top">x</a>')
     assert python(SCRIPT, tmp_path).returncode == 0

@@ -16,16 +16,16 @@ def flat(tex: str) -> str:
     return "".join(mathml(tex, display=True).split())
 
 
-def test_an_index_stands_beside_a_letter_with_an_accent() -> None:
+def test_index_is_placed_beside_an_accented_letter() -> None:
     rendered = flat(r"\dot q_t")
     assert "<msub><moveraccent" in rendered
     assert "munderover" not in rendered
 
 
-def test_bars_of_a_norm_are_as_high_as_letters() -> None:
+def test_norm_bars_have_letter_height() -> None:
     assert flat(r"\lVert x_i\rVert").count('stretchy="false">‖') == 2
 
 
 @pytest.mark.parametrize(("tex", "spaces"), [(r"a\cos x", 2), (r"\cos x", 1), (r"\cos(x)", 0)])
-def test_functions_stand_apart(tex: str, spaces: int) -> None:
+def test_functions_are_spaced(tex: str, spaces: int) -> None:
     assert flat(tex).count("0.17em") == spaces

@@ -154,7 +154,7 @@ def test_files_are_accepted() -> None:
     assert set(examined) == {"grasp", "scene", "robot", "candidates"}
 
 
-def test_faults_are_seen() -> None:
+def test_wrong_commands_are_detected() -> None:
     assert not fault("casadi-ik solve cup --scene table  # free")
     assert fault("casadi-ik solved cup") == "no command 'solved'"
     assert fault("casadi-ik log why cup.mcap --scene table") == "no option --scene"
@@ -167,7 +167,7 @@ def test_faults_are_seen() -> None:
     [page for page in PAGES if python_blocks(page) and page.stem not in NOT_PASTED],
     ids=lambda path: path.stem,
 )
-def test_python_runs_when_pasted(page: Path, folder: Path) -> None:
+def test_python_blocks_run(page: Path, folder: Path) -> None:
     """Every block alone, or after the page's first one."""
     save_files(page, folder)
     first, *later_blocks = python_blocks(page)
@@ -193,7 +193,7 @@ def grasps_shown() -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 @pytest.mark.slow
-def test_every_grasp_shown_is_solved(tmp_path: Path) -> None:
+def test_every_grasp_on_the_pages_is_solved(tmp_path: Path) -> None:
     grasps_on_pages = list(grasps_shown())
     assert len(grasps_on_pages) >= 5
     for source, data in grasps_on_pages:
@@ -257,13 +257,13 @@ def gone_through(page: Path, folder: Path) -> list[str]:
         ("logs", 9),
     ],
 )
-def test_pages_are_gone_through(page: str, count: int, folder: Path) -> None:
+def test_step_by_step_pages_run(page: str, count: int, folder: Path) -> None:
     """Commands, Python and files in the order of the page, as one reader does it."""
     path = next(candidate for candidate in PAGES if candidate.stem == page)
     assert len(gone_through(path, folder)) >= count
 
 
-def test_the_readme_is_short_and_says_what_is_so(folder: Path) -> None:
+def test_readme_is_short_and_correct(folder: Path) -> None:
     text = PAGES[0].read_text(encoding="utf-8")
     assert text.count("\n") <= 120
     cells = [c for line in text.splitlines() if line.startswith("|") for c in line.split("|")]

@@ -75,7 +75,7 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
 
 
 @pytest.mark.slow
-def test_collisions_of_a_body_are_looked_at_in_double_precision(tmp_path, capsys):
+def test_exported_collision_checks_use_double_precision(tmp_path, capsys):
     words = ["export", "g1+dex3", "--scene", "8", "--single", "--out", str(tmp_path / "g1")]
     assert main(words) == 2
     assert re.search(r"--single: g1\+dex3 .*--scene", capsys.readouterr().err)
@@ -108,7 +108,7 @@ int main(void) { /* pose of a box; rows of numbers: whether there is a q0, point
 @pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("name", ["two_ur10e+barrett_bh8_280", "mobile_kuka_lwr_barrett"])
-def test_a_body_keeps_clear_of_a_scene_and_of_itself(tmp_path, name):
+def test_exported_body_keeps_clear_of_scene_and_itself(tmp_path, name):
     """Of targets that a posture meets which touches nothing; every third has an idle finger."""
     robot = ik.load_robot(name)
     write_folder(tmp_path, c_project(robot, "arm", 2))
@@ -154,7 +154,7 @@ def test_a_body_keeps_clear_of_a_scene_and_of_itself(tmp_path, name):
 
 @pytest.mark.slow
 @needs_gcc
-def test_a_body_s_sides_and_trunk_go_with_it(tmp_path):
+def test_exported_body_has_sides_and_trunk(tmp_path):
     """A G1's answers, without a warning; the hands of each side are found in a file of its own."""
     write_folder(tmp_path, c_project(ik.load_robot("g1+dex3"), "g1"))
     assert (tmp_path / "src" / "g1_side_0.c").is_file()
@@ -195,7 +195,7 @@ def test_stored_targets_bit_for_bit_on_other_machines(
 
 
 @pytest.mark.slow
-def test_in_a_scene_arms_swing_out_of_the_way(robot):
+def test_exported_arms_avoid_the_scene(robot):
     """Or the comparison of stored answers would say nothing of the choice among arms."""
     solver = ik.Solver(robot)
     targets = SceneTargets(solver, 8)
@@ -248,7 +248,7 @@ def malformed(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, ...]:
 
 @needs_gcc
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
-def test_malformed_targets_end_as_in_python(plain_project):
+def test_malformed_targets_have_the_same_status_as_in_python(plain_project):
     """What Python refuses is bad input in C; all else ends alike, in the same configuration."""
     robot, count = ik.load_robot("ar10"), 1500
     (plain_project / "asked.c").write_text(QUERY_PROGRAM)
@@ -300,7 +300,7 @@ int main(void) { /* how many solids, each: kind, size, pose; points, normals */
 
 @pytest.mark.slow
 @needs_gcc
-def test_other_hands_are_looked_at_as_in_python(tmp_path):
+def test_other_hands_match_python(tmp_path):
     """Grasps of the page, the object in the hand: C and Python look alike for what is free."""
     page = runpy.run_path(str(Path(__file__).parents[2] / "page" / "build.py"))
     robot, out = ik.load_robot("panda+shadow"), tmp_path / "solver"
@@ -362,21 +362,21 @@ def test_wrapper_in_cpp(project, tmp_path):
         (["--target", "fpga"], "--target: .*'fpga'.*c, wasm"),
     ],
 )
-def test_bad_words_are_refused(tmp_path, capsys, words, complaint):
+def test_bad_export_options_are_refused(tmp_path, capsys, words, complaint):
     out = tmp_path / "solver"
     assert main(["export", "kuka_lwr_barrett", "--out", str(out), *words]) == 2
     assert re.search(complaint, capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_no_export_is_left_alone(tmp_path, capsys):
+def test_other_folders_are_not_overwritten(tmp_path, capsys):
     (tmp_path / "thesis.tex").write_text("years of work")
     assert main(["export", "kuka_lwr_barrett", "--out", str(tmp_path)]) == 2
     assert str(tmp_path) in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_an_earlier_export_is_replaced_as_a_whole(tmp_path):
+def test_earlier_export_is_replaced_completely(tmp_path):
     out = tmp_path / "solver"
     write_folder(out, {"old.c": "old"})
     write_folder(out, {"src/new.c": "new"})
@@ -400,7 +400,7 @@ def test_names_of_robots_become_names_of_c(name, prefix):
     assert checked_prefix(None, name) == prefix
 
 
-def test_names_from_files_end_no_comment():
+def test_file_names_do_not_end_comments():
     assert plain("arm */ #include <x>\n") == "arm __ _include _x__"
 
 
@@ -414,7 +414,7 @@ def test_kernels_compiled_ahead_with_progress(capsys):
     assert numbers == [(str(i), str(len(numbers))) for i in range(1, len(numbers) + 1)]
 
 
-def test_without_a_compiler_nothing_is_compiled_ahead(monkeypatch, capsys):
+def test_no_compiler_means_no_precompiled_kernels(monkeypatch, capsys):
     monkeypatch.setenv("CC", "none")
     assert main(["compile", "kuka_lwr_barrett"]) == 2
     assert "compiler" in capsys.readouterr().err
@@ -466,7 +466,7 @@ def test_c_in_single_precision(double, single):
     assert in_single_precision(single) == single
 
 
-def test_limits_are_moved_inwards(robot):
+def test_limits_are_rounded_inwards(robot):
     lower, upper = SinglePrecision(robot).bounds
     for bounds in (lower, upper):
         assert np.array_equal(bounds, bounds.astype(np.float32))
@@ -476,7 +476,7 @@ def test_limits_are_moved_inwards(robot):
 
 
 @needs_gcc
-def test_sines_and_arcs_to_their_last_places(tmp_path):
+def test_trigonometric_functions_are_accurate_to_the_last_place(tmp_path):
     (tmp_path / "places.c").write_text(driver_text("elementary_single") + LAST_PLACES)
     output_of(
         "gcc", *WARNED, "-O1", "-ffp-contract=off", "places.c", "-o", "places", "-lm", cwd=tmp_path
@@ -497,7 +497,7 @@ def single_project(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.mark.slow
-def test_nothing_is_double(single_project):
+def test_single_precision_export_contains_no_double(single_project):
     for path in (*single_project.glob("src/*"), *single_project.glob("include/*")):
         text = path.read_text()
         assert not re.search(r"\bdouble\b", re.sub(r"/\*.*?\*/|//[^\n]*", "", text, flags=re.S))
@@ -506,7 +506,7 @@ def test_nothing_is_double(single_project):
 
 @pytest.mark.slow
 @needs_gcc
-def test_what_it_solves_is_solved_in_double_precision(single_project):
+def test_single_precision_solutions_hold_in_double_precision(single_project):
     """By its own test, under sanitizers; the long generated file without, which takes as long."""
     other_lines = [
         f"src/{path.name}" for path in single_project.glob("src/*.c") if "_solve.c" not in path.name

@@ -112,7 +112,7 @@ def stream(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 @needs_gcc
-def test_follows_as_in_python_and_within_limits(robot, project):
+def test_follower_matches_python_and_keeps_limits(robot, project):
     program = built(project, "followed", FOLLOW_PROGRAM, "arm_follow", "-O1", *SANITIZERS)
     points, normals, palms = stream(robot, 1000)
     rows = np.hstack([points.reshape(len(points), -1), normals.reshape(len(points), -1), palms])
@@ -137,7 +137,7 @@ def test_follows_as_in_python_and_within_limits(robot, project):
 
 
 @needs_gcc
-def test_what_moves_within_reach_is_followed_closely(robot, project):
+def test_reachable_motion_is_followed_closely(robot, project):
     """The motors stand still in the last second of four in which the target does."""
     program = built(project, "closely", FOLLOW_PROGRAM, "arm_follow", "-O1")
     second = round(1 / PERIOD)
@@ -154,7 +154,7 @@ def test_what_moves_within_reach_is_followed_closely(robot, project):
 
 
 @needs_gcc
-def test_the_way_back_is_as_in_python(robot, project):
+def test_return_path_matches_python(robot, project):
     program = built(project, "back", FOLLOW_PROGRAM, "arm_follow", "-O1", *SANITIZERS)
     rng = np.random.default_rng(7)
     postures = np.concatenate([robot.random(rng, 1) for _ in range(4)])
@@ -170,7 +170,7 @@ def test_the_way_back_is_as_in_python(robot, project):
 
 
 @needs_gcc
-def test_palms_as_in_python(robot, project):
+def test_palms_match_python(robot, project):
     program = built(project, "palms", PALMS, "*", "-O0", "-Isrc")
     q = robot.random(np.random.default_rng(4), 60)
     poses = robot.palm(q)
@@ -190,7 +190,7 @@ def test_palms_as_in_python(robot, project):
     np.testing.assert_array_equal(statuses[:50][:, list(hand)], q[:50][:, list(hand)])
 
 
-def test_in_single_precision_nothing_follows(tmp_path, capsys):
+def test_single_precision_has_no_follower(tmp_path, capsys):
     words = ["export", "kuka_lwr_barrett", "--follow", "--single", "--out", str(tmp_path / "s")]
     assert main(words) == 2
     assert "--follow: " in capsys.readouterr().err
@@ -220,7 +220,7 @@ console.log(JSON.stringify({ rows, ended, refused, length }));
     shutil.which("node") is None or importlib.util.find_spec("ziglang") is None,
     reason="needs node and the package ziglang",
 )
-def test_in_javascript_too(tmp_path):
+def test_javascript_follower_matches(tmp_path):
     out = tmp_path / "module"
     words = ["export", "ar10", "--prefix", "arm", "--target", "wasm", "--follow"]
     assert main([*words, "--out", str(out)]) == 0
@@ -254,7 +254,7 @@ int main(void) { /* q0, points, normals */
 
 
 @needs_gcc
-def test_a_joint_without_limits_has_no_border(tmp_path):
+def test_joint_without_limits_is_continuous(tmp_path):
     """A solver answers in the turn nearest to q0, and a follower turns on."""
     source = on_pedestal(ik.load_robot("ur5e+panda_hand"), tmp_path, continuous=("ur5e_joint_1",))
     out = tmp_path / "solver"

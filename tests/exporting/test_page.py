@@ -293,7 +293,7 @@ def as_in_python(module: Path) -> None:
 
 
 # One test, since building takes as long as all that is done with what was built.
-def test_page(
+def test_page_works_in_a_browser(
     tmp_path: Path,
     request: pytest.FixtureRequest,
     monkeypatch: pytest.MonkeyPatch,
@@ -335,7 +335,7 @@ console.log(JSON.stringify({ found, motors, fingers }));
 """
 
 
-def test_a_hand_without_a_scene(tmp_path):
+def test_page_of_a_hand_without_a_scene(tmp_path):
     robot = ik.load_robot("ar10")
     module = tmp_path / "module"
     write_folder(module, wasm_project(robot, "arm"))

@@ -95,7 +95,7 @@ def test_normals_of_any_length_in_a_batch(robot) -> None:
 
 
 @pytest.mark.parametrize("kind", ["complex", "masked"])
-def test_numbers_that_would_lose_something(robot, kind: str) -> None:
+def test_lossy_numbers_are_refused(robot, kind: str) -> None:
     points, normals = robot.contacts(robot.home[None])
     odd = points + 1j if kind == "complex" else np.ma.masked_greater(points, 0)
     solver = ik.Solver(robot)
@@ -107,14 +107,14 @@ def test_numbers_that_would_lose_something(robot, kind: str) -> None:
         ik.Contact(odd[0, 0])
 
 
-def test_a_name_that_commands_a_terminal_or_fills_it() -> None:
+def test_terminal_commands_in_names_are_escaped() -> None:
     text = str(ik.errors.InputError("\x1b[2J" + "x" * 5000))
     assert text.isprintable()
     assert len(text) <= ik.errors.MAX_MESSAGE_LENGTH
     assert text.endswith("xxx")
 
 
-def test_an_output_that_is_the_input_by_another_name(tmp_path: Path) -> None:
+def test_output_equal_to_the_input_is_refused(tmp_path: Path) -> None:
     source, link = tmp_path / "in.yaml", tmp_path / "link.mcap"
     source.write_text("")
     link.hardlink_to(source)
@@ -153,7 +153,7 @@ def test_hostile_npz(tmp_path: Path, shape: tuple[int, ...], size: int, says: st
 
 
 @POSIX
-def test_an_endless_file() -> None:
+def test_endless_file_is_refused() -> None:
     with pytest.raises(ik.errors.InputError, match="not a regular file"):
         TargetFile(Path("/dev/zero"), 3).check(64)
 

@@ -197,6 +197,6 @@ def test_every_key_is_explained(kind: str) -> None:
             assert "const" in property_schema or property_schema.get("description"), f"{name}.{key}"
 
 
-def test_every_file_of_the_catalogue_is_of_a_kind() -> None:
+def test_every_catalogue_file_has_a_kind() -> None:
     for folder in FOLDERS.values():
         assert ik.shipped_names(folder)

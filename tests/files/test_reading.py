@@ -59,7 +59,7 @@ def test_quantity(tmp_path, written, value):
     assert entry(tmp_path, f"number: {written}").number == pytest.approx(value, rel=1e-15)
 
 
-def test_text_that_is_no_quantity_stays_text(tmp_path):
+def test_other_text_is_not_a_quantity(tmp_path):
     assert entry(tmp_path, "text: 2 rings and a nut").text == "2 rings and a nut"
 
 

@@ -135,7 +135,7 @@ def test_bad_file(tmp_path: Path, old: str, new: str, key: str, says: str) -> No
         ("a: \tb: c\n", "", "not valid YAML"),
     ],
 )
-def test_hopeless_file(tmp_path: Path, text: str, key: str, says: str) -> None:
+def test_hopeless_file_is_refused(tmp_path: Path, text: str, key: str, says: str) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(text)
     refused(path, key, says)

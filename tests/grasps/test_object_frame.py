@@ -62,17 +62,17 @@ def test_points_and_directions_go_with_the_object(pose):
 
 
 @given(poses, poses)
-def test_one_after_the_other_is_their_product(first, then):
+def test_successive_poses_compose(first, then):
     assert_same(ALL_KINDS.at(first).at(then), ALL_KINDS.at(then @ first))
 
 
 @given(poses)
-def test_back_where_it_was(pose):
+def test_inverse_pose_restores_the_grasp(pose):
     assert_same(ALL_KINDS.at(pose).at(np.linalg.inv(pose)), ALL_KINDS)
     assert_same(ALL_KINDS.at(pose).in_object_frame(), ALL_KINDS)
 
 
-def test_a_grasp_that_knows_its_object_is_taken_along(robot):
+def test_grasp_moves_with_its_object(robot):
     grasp = ik.load_grasp("cup")
     object_pose = np.eye(4)
     object_pose[:3, 3] = [0.02, -0.03, 0.04]
@@ -97,6 +97,6 @@ def test_a_grasp_that_knows_its_object_is_taken_along(robot):
         (np.vstack([np.eye(4)[:3], [0.5, 0, 0, 1]]), "pose: .*last row"),
     ],
 )
-def test_what_is_no_pose(pose, says):
+def test_malformed_poses_are_refused(pose, says):
     with pytest.raises(ik.errors.InputError, match=says):
         ALL_KINDS.at(pose)

@@ -92,7 +92,7 @@ def test_every_object_and_hand_has_grasps() -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_contacts_are_on_the_surface_face_into_it_and_keep_away_from_edges(name: str) -> None:
+def test_contacts_are_on_the_surface_and_away_from_edges(name: str) -> None:
     grasp = ik.load_grasp(name)
     item = grasps.load_object(grasp.object)
     assert next(iter(grasp.contacts)) == robot_of(grasp.robot).thumb
@@ -107,7 +107,7 @@ def test_contacts_are_on_the_surface_face_into_it_and_keep_away_from_edges(name:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_posture_keeps_limits_and_reproduces_the_contacts(name: str) -> None:
+def test_posture_keeps_limits_and_reproduces_the_contacts(name: str) -> None:
     """A rigid motion takes the fingertips to the contacts, pads included."""
     grasp = ik.load_grasp(name)
     robot = robot_of(grasp.robot)
@@ -154,7 +154,7 @@ def test_the_squeeze_stays_inside_friction_cones(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_solved_exactly_and_on_a_table_nothing_touches_but_the_pads(name: str) -> None:
+def test_grasps_are_solved_and_collision_free_on_a_table(name: str) -> None:
     grasp = ik.load_grasp(name)
     solution = solver_of(grasp.robot).solve(grasp)
     assert solution.success, solution.status
@@ -168,7 +168,7 @@ def run(script: str, *words: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_the_script_agrees_and_refuses_a_broken_file(tmp_path: Path) -> None:
+def test_script_verifies_and_refuses_a_broken_file(tmp_path: Path) -> None:
     words = "make_grasps.py", "--check", "--only", "cup"
     done = run(*words)
     assert (done.returncode, done.stdout.strip()) == (0, "cup: good")
@@ -182,7 +182,7 @@ def test_the_script_agrees_and_refuses_a_broken_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_script_of_the_papers_slider_hand_makes_a_shipped_file(tmp_path: Path) -> None:
+def test_slider_hand_script_reproduces_a_shipped_file(tmp_path: Path) -> None:
     """To six digits: the optimiser may differ in the last ones from machine to machine."""
     done = run("make_ar10_grasps.py", "--out", tmp_path, "--only", "golf_ball")
     assert (done.returncode, done.stderr) == (0, "")
@@ -197,7 +197,7 @@ def test_the_script_of_the_papers_slider_hand_makes_a_shipped_file(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_the_script_of_catalogue_hands_makes_a_grasp_that_is_exact(tmp_path: Path) -> None:
+def test_catalogue_script_makes_an_exact_grasp(tmp_path: Path) -> None:
     done = run("make_hand_grasps.py", "--out", tmp_path, "--only", "robotiq_2f85_tennis_ball")
     assert done.returncode == 0, done.stderr
     grasp = ik.load_grasp(tmp_path / "robotiq_2f85_tennis_ball.yaml")

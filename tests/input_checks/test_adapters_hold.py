@@ -38,7 +38,7 @@ def lerobot(monkeypatch):
 
 
 @pytest.mark.parametrize("name", LOST_VALUES)
-def test_the_arm_of_lerobot_stays(lerobot, name):
+def test_lerobot_arm_holds_after_bad_input(lerobot, name):
     robot = ik.load_robot("ur5e")
     arm = lerobot.ArmKinematics(ik.Solver(robot))
     angles = np.rad2deg(robot.home)
@@ -50,7 +50,7 @@ def test_the_arm_of_lerobot_stays(lerobot, name):
 
 
 @pytest.mark.parametrize("number", [0.0, -1.0, np.nan, np.inf])
-def test_contacts_of_lerobot_stay(lerobot, robot, number):
+def test_lerobot_contacts_hold_after_bad_input(lerobot, robot, number):
     step = lerobot.ContactsToJoints(ik.Solver(robot))
     action = {f"{name}.{key}": number for name in robot.fingers for key in "xyz"}
     done = step.action(action)
@@ -58,7 +58,7 @@ def test_contacts_of_lerobot_stay(lerobot, robot, number):
     np.testing.assert_array_equal([done[f"{name}.pos"] for name in robot.actuators], robot.home)
 
 
-def test_messages_of_ros_without_an_orientation_are_refused(robot):
+def test_ros_messages_without_orientation_are_refused(robot):
     ros2 = pytest.importorskip("casadi_ik.integrations.ros2")
     points, normals = robot.contacts(robot.home)
     message = bytearray(ros2.encode_contacts(points, normals))

@@ -22,18 +22,20 @@ def grasp() -> ik.Grasp:
 
 
 @pytest.mark.parametrize("of", [lambda g: None, lambda g: g, lambda g: "cup", lambda g: {"a": g}])
-def test_candidates_that_are_none(solver: ik.Solver, grasp: ik.Grasp, of: Callable[..., Any]):
+def test_non_grasp_candidates_are_refused(
+    solver: ik.Solver, grasp: ik.Grasp, of: Callable[..., Any]
+):
     with pytest.raises(ik.errors.InputError, match=r"^grasps:.*\w+"):
         solver.choose(of(grasp))
 
 
-def test_candidates_of_a_generator(solver: ik.Solver, grasp: ik.Grasp) -> None:
+def test_generator_of_candidates_is_accepted(solver: ik.Solver, grasp: ik.Grasp) -> None:
     ranking = solver.choose(candidate for candidate in (grasp, ik.load_grasp("apple")))
     assert (ranking.candidates, ranking.answered) == (2, 2)
 
 
 @pytest.mark.parametrize("prefer", [failing, lambda: 0.0, lambda robot, q: "high"])
-def test_a_preference_that_fails(solver: ik.Solver, grasp: ik.Grasp, prefer: Any) -> None:
+def test_failing_preference_is_reported(solver: ik.Solver, grasp: ik.Grasp, prefer: Any) -> None:
     with pytest.raises(ik.errors.InputError, match=r"^prefer: ") as caught:
         solver.choose([grasp], prefer=prefer)
     assert caught.value.__cause__ is not None
@@ -47,7 +49,7 @@ def test_a_time_between_frames(robot: ik.ArmHand, tmp_path: Path, elapsed: Any) 
         retargeter(np.random.default_rng(0).uniform(0, 0.1, (21, 3)), elapsed=elapsed)
 
 
-def test_sensitivity_of_no_answers(solver: ik.Solver) -> None:
+def test_sensitivity_of_empty_batch(solver: ik.Solver) -> None:
     q, contacts = np.zeros((0, 14)), np.zeros((0, 3, 3))
     assert solver.sensitivity(q, contacts, contacts).points.shape == (0, 14, 3, 3)
     weighted = solver.sensitivity(q, contacts, contacts, np.zeros((0, 14)))
@@ -55,7 +57,7 @@ def test_sensitivity_of_no_answers(solver: ik.Solver) -> None:
 
 
 @pytest.mark.parametrize("of", [lambda g: g, lambda g: None, lambda g: np.zeros(14)])
-def test_placing_what_is_not_an_answer(
+def test_placing_a_non_solution_is_refused(
     solver: ik.Solver, grasp: ik.Grasp, of: Callable[..., Any]
 ) -> None:
     with pytest.raises(ik.errors.InputError, match=r"^held: "):

@@ -60,7 +60,7 @@ def test_every_order_is_recognised_in_one_frame(name, bend, size, seed, mirrored
 
 
 @pytest.mark.parametrize("name", OTHER_ORDERS)
-def test_a_retargeter_converts_them(robot, config, name):
+def test_retargeter_converts_keypoint_orders(robot, config, name):
     plain, converting = (ik.motion.Retargeter(config, robot) for _ in range(2))
     expected = [plain(keypoint_frame(i)) for i in range(4)]
     with pytest.warns(InputWarning, match="order"):
@@ -73,7 +73,7 @@ def test_a_retargeter_converts_them(robot, config, name):
         np.testing.assert_array_equal(target.palm, expected_target.palm)
 
 
-def test_lost_frames_before_tell_no_order(robot, config):
+def test_lost_frames_do_not_decide_the_order(robot, config):
     plain, converting = (ik.motion.Retargeter(config, robot) for _ in range(2))
     for lost_frame in (np.zeros((21, 3)), -np.ones((21, 3)), np.full((21, 3), np.nan)):
         assert converting(lost_frame).reason
@@ -82,7 +82,7 @@ def test_lost_frames_before_tell_no_order(robot, config):
     np.testing.assert_array_equal(target.points, plain(keypoint_frame()).points)
 
 
-def test_the_usual_order_and_unknown_ones(robot, config):
+def test_standard_and_unknown_orders(robot, config):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ik.motion.Retargeter(config, robot)(keypoint_frame())
@@ -91,7 +91,7 @@ def test_the_usual_order_and_unknown_ones(robot, config):
         ik.motion.Retargeter(config, robot)(mixed)
 
 
-def test_a_recording_in_the_order_of_mano(tmp_path, capsys):
+def test_recording_in_mano_order(tmp_path, capsys):
     frames = np.array([keypoint_frame(i) for i in range(12)])
     motions = []
     for keypoints in (frames, reordered(frames, "MANO, HO-3D")):

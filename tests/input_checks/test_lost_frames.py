@@ -61,7 +61,7 @@ def solver(robot):
 
 @pytest.mark.parametrize("name", LOST_FRAMES)
 @pytest.mark.parametrize("first", [True, False])
-def test_a_lost_hand_is_held_first_or_later(robot, solver, config, name, first):
+def test_lost_hand_is_held(robot, solver, config, name, first):
     """Good frames give what they give without the lost one."""
     retargeter, plain = (ik.motion.Retargeter(config, robot) for _ in range(2))
     follower = solver.follow(robot.home, period=1 / 30)
@@ -82,7 +82,7 @@ def test_a_lost_hand_is_held_first_or_later(robot, solver, config, name, first):
 
 
 @pytest.mark.parametrize("name", ODD)
-def test_what_differs_from_other_frames_is_held(robot, config, name):
+def test_outlier_frames_are_held(robot, config, name):
     retargeter = ik.motion.Retargeter(config, robot)
     for i in range(3):
         assert not retargeter(keypoints(i)).reason
@@ -91,7 +91,7 @@ def test_what_differs_from_other_frames_is_held(robot, config, name):
     assert not retargeter(keypoints(3)).reason
 
 
-def test_a_hand_that_is_seen_again_elsewhere_is_followed(robot, config):
+def test_hand_that_reappears_elsewhere_is_followed(robot, config):
     retargeter = ik.motion.Retargeter(config, robot)
     retargeter(keypoints())
     accepted = [not retargeter(keypoints(i) + np.array([1.0, 0.0, 0.0])).reason for i in range(8)]

@@ -227,7 +227,7 @@ def test_a_tangent_that_is_not_across_the_normal_is_refused():
         ik.Contact(POINT, normal=[1, 0, 0], tangent=[0.01, 1, 0])
 
 
-def test_half_of_the_root_of_two_with_four_decimals():
+def test_rounded_half_square_roots_are_accepted():
     """What people type."""
     turn = [[0.7071, -0.7071, 0, 0.5], [0.7071, 0.7071, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]
     c = np.sqrt(0.5)
@@ -260,7 +260,7 @@ CALLS: dict[str, Callable[[Any, Array], Any]] = {
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_calls_of_a_solver_have_the_same_rule(setting, name):
+def test_solver_calls_apply_the_same_rule(setting, name):
     rounded = pose_of(np.round(matrix_of(np.array([0.9, 0.1, -0.3, 0.3])), 3))
     CALLS[name](setting, rounded)
     stretched = pose_of(np.diag([1.0, 1.0, 1.0 + 2 * MAX_SKEW]))

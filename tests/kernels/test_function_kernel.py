@@ -55,7 +55,7 @@ def test_matrices_are_row_major(compiled, kind):
 
 @needs_compiler
 @pytest.mark.parametrize("in_lanes", [False, True])
-def test_parts_are_called_with_what_is_there_or_put_together(in_lanes, rng):
+def test_subfunctions_are_called_or_inlined(in_lanes, rng):
     """Neighbours in memory, results of another part, comparisons, and a result nobody asks for."""
     x, w = ca.SX.sym("x", 3), ca.SX.sym("w", 2)
     inner = call_function("inner", [x, w], [2 * ca.sin(x) + w[0], ca.sumsqr(x) * w[1]])
@@ -164,7 +164,7 @@ def graph() -> FunctionGraph:
 
 @pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 64, 1003])
-def test_any_number_of_samples(count, compiled):
+def test_sample_counts_in_lanes(count, compiled):
     rng = np.random.default_rng(count)
     x = rng.normal(size=(count, 3)) * [10.0 ** rng.uniform(-8, 4), 1.0, 1.0]
     (values,) = FunctionKernel(graph(), compiled, in_lanes=True)(x)
@@ -227,7 +227,7 @@ def test_signs_of_zero(functions):
     np.testing.assert_array_equal(np.signbit(last_column), np.signbit(zeros[:, 1]))
 
 
-def test_one_lane_that_is_large_changes_no_other(
+def test_large_lane_does_not_affect_others(
     functions,
 ):
     points = np.random.default_rng(5).normal(size=(64, 2))
@@ -237,7 +237,7 @@ def test_one_lane_that_is_large_changes_no_other(
 
 @settings(max_examples=300, deadline=None)
 @given(st.floats(allow_subnormal=False), st.floats(-1e6, 1e6, allow_subnormal=False))
-def test_any_number(functions, x, y):
+def test_sample_counts_of_special_functions(functions, x, y):
     single_kernel, beside = functions
     points = np.array([[x, y]] * 3)
     (values,) = single_kernel(points)
@@ -362,7 +362,7 @@ def test_operations_on_special_numbers():
     assert np.isfinite(compiled_values).any(axis=0).all()
 
 
-def test_what_has_no_c_code_is_named():
+def test_functions_without_c_code_are_named():
     x = ca.MX.sym("x", 3)
     solver = ca.rootfinder("root", "newton", {"x": x, "g": x**2 - 2})
     function = ca.Function("hidden_solver", [x], [solver(x, [])])
@@ -404,7 +404,7 @@ def test_nearest_in_order(compiled, rows, size, rng):
 
 
 @BOTH
-def test_nearest_where_nothing_is_known_is_the_first(compiled, rng):
+def test_nearest_of_unknown_values_is_the_first(compiled, rng):
     lookup = LookupKernel(identity(3), [rng.normal(size=(30, 3))], compiled)
     np.testing.assert_array_equal(lookup(4, np.full((2, 3), np.nan)), [[0, 1, 2, 3]] * 2)
 

@@ -36,7 +36,7 @@ def numbers(layout: Layout, lead: tuple[int, ...] = ()) -> dict[str, Any]:
 
 
 @given(layouts())
-def test_numbers_go_round(layout):
+def test_arrays_round_trip(layout):
     values = numbers(layout)
     vector = layout.pack(values)
     np.testing.assert_array_equal(vector, np.arange(layout.size) + 0.5)
@@ -54,7 +54,7 @@ def test_unpacking_keeps_leading_dimensions(layout):
 
 
 @given(layouts(), st.booleans())
-def test_symbols_lie_where_numbers_lie(layout, mixed):
+def test_symbols_have_the_layout_of_arrays(layout, mixed):
     values = numbers(layout)
     symbols: dict[str, Any] = {
         item.name: ca.SX.sym(item.name, *(item.shape if item.shape else (1,))) for item in layout
@@ -69,7 +69,7 @@ def test_symbols_lie_where_numbers_lie(layout, mixed):
 
 
 @given(layouts())
-def test_symbols_go_round(layout):
+def test_symbols_round_trip(layout):
     vector = layout.symbols("v")
     vector_again = layout.pack(layout.unpack(vector))
     assert vector_again.sparsity().is_dense()

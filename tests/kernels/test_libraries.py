@@ -116,7 +116,7 @@ def test_second_use_builds_nothing(directory, monkeypatch):
 
 
 @needs_compiler
-def test_everything_a_library_follows_from_tells_it_apart(directory, monkeypatch):
+def test_every_dependency_changes_the_library_name(directory, monkeypatch):
     for factor in (2.0, 2.5):
         assert FunctionKernel(scaled(factor))(3)[0] == 3 * factor
     LoopKernel(counting_step("scaled"))
@@ -169,7 +169,7 @@ def test_broken_note_is_written_again(directory, monkeypatch, note):
     assert kernel(never)(3)[0] == 6
 
 
-def test_recipes_differ_where_their_data_do():
+def test_recipes_depend_on_their_data():
     robot, same_robot = (ik.load_robot("kuka_lwr_barrett").description for _ in range(2))
     moved_robot, machine = (replace(robot, home=robot.home + by) for by in (1e-9, 1e-16))
     assert recipe(robot, 8) == recipe(same_robot, 8) == recipe(machine, 8)
@@ -185,7 +185,7 @@ def test_recipes_differ_where_their_data_do():
 
 
 @needs_compiler
-def test_processes_that_need_the_same_build_it_once(directory):
+def test_concurrent_processes_build_once(directory):
     text = """
         import sys
         import casadi as ca
@@ -214,7 +214,7 @@ def test_processes_that_need_the_same_build_it_once(directory):
 
 @needs_compiler
 @pytest.mark.parametrize("made_for", ["these sources", "others"])
-def test_kernels_made_ahead_serve_without_a_compiler(directory, tmp_path, monkeypatch, made_for):
+def test_prebuilt_kernels_work_without_a_compiler(directory, tmp_path, monkeypatch, made_for):
     texts: dict[str, str] = {}
     monkeypatch.setattr(libraries, "text_listeners", [texts.__setitem__])
     assert works()
@@ -247,7 +247,7 @@ def test_kernels_made_ahead_serve_without_a_compiler(directory, tmp_path, monkey
 
 
 @needs_compiler
-def test_blocks_that_build_nothing(directory):
+def test_cache_only_blocks_build_nothing(directory):
     with virtual_machine():
         assert not kernel(never).compiled
     with cached_only(), pytest.raises(libraries.NotCachedError):
@@ -343,7 +343,7 @@ def lie(directory: Path, monkeypatch: pytest.MonkeyPatch, property_name: str) ->
         ('echo "no such header.h" >&2; exit 1', r"exit code 1.*no such header\.h"),
     ],
 )
-def test_a_compiler_that_lies(directory, monkeypatch, property_name, expected_words):
+def test_faulty_compilers_are_reported(directory, monkeypatch, property_name, expected_words):
     lie(directory, monkeypatch, property_name)
     with pytest.raises(ik.errors.KernelError, match=expected_words) as caught:
         kernel()
@@ -454,7 +454,7 @@ def test_planted_libraries_are_not_loaded(directory, monkeypatch, danger):
 @POSIX
 @needs_compiler
 @pytest.mark.parametrize("danger", ["theirs", "writable"])
-def test_a_planted_note_is_not_believed(directory, monkeypatch, danger):
+def test_planted_note_is_ignored(directory, monkeypatch, danger):
     assert works()
     (note,), (library,) = cached_files(directory, ".key"), cached_files(directory, ".so")
     wrong = "0" * 32
@@ -482,7 +482,7 @@ def test_cache_directory(monkeypatch, tmp_path):
 
 
 @POSIX
-def test_folders_are_the_users_alone(directory, monkeypatch):
+def test_cache_folders_are_private(directory, monkeypatch):
     """Made so, whatever the mask; of one above a sticky one is enough."""
     monkeypatch.setenv("CASADI_IK_CACHE", str(directory / "a"))
     mask_before = os.umask(0)
@@ -503,7 +503,7 @@ def test_folders_are_the_users_alone(directory, monkeypatch):
 @pytest.mark.parametrize(
     "place", ["file in the way", "too long", "dead link", "no name", "unreadable", "read-only"]
 )
-def test_places_that_are_no_use(tmp_path, directory, monkeypatch, place):
+def test_unusable_cache_folders(tmp_path, directory, monkeypatch, place):
     """One line, and a folder of the user's own among temporary files serves: the next finds it."""
     expected_folder = directory
     if place == "file in the way":
@@ -559,7 +559,7 @@ def test_a_full_disk(directory, monkeypatch):
 
 @POSIX
 @needs_compiler
-def test_a_compiler_that_finds_the_disk_full(directory, monkeypatch):
+def test_compiler_reporting_a_full_disk(directory, monkeypatch):
     lie(directory, monkeypatch, 'echo "as: write error: No space left on device" >&2; exit 1')
     with pytest.warns((CacheWarning, NoCompilerWarning)) as caught:
         assert not kernel().compiled
@@ -568,7 +568,7 @@ def test_a_compiler_that_finds_the_disk_full(directory, monkeypatch):
 
 @POSIX
 @needs_compiler
-def test_a_working_folder_that_is_gone(tmp_path):
+def test_deleted_working_folder(tmp_path):
     """A relative place cannot be found then; one line, and the answer is right all the same."""
     text = f"""
         import os
@@ -599,7 +599,7 @@ class Pressed:
 
 @needs_compiler
 @pytest.mark.parametrize("moment", ["graph", "compiler"])
-def test_ctrl_c_leaves_nothing(directory, monkeypatch, moment):
+def test_ctrl_c_leaves_no_files(directory, monkeypatch, moment):
     def build() -> ca.Function:
         with suppress(TypeError):
             _ = ca.SX.sym("x") * Pressed()  # type: ignore[operator]
@@ -619,7 +619,7 @@ def test_ctrl_c_leaves_nothing(directory, monkeypatch, moment):
 
 
 @needs_compiler
-def test_what_killed_compilations_left_goes(directory):
+def test_leftovers_of_killed_compilations_are_removed(directory):
     """Of dead processes after an hour, of unknown ones after a day, and nothing else."""
     ended_process = subprocess.Popen(["true"])
     ended_process.wait()
@@ -655,7 +655,7 @@ def age(path: Path, seconds: float) -> None:
 
 
 @needs_compiler
-def test_a_compilation_that_is_killed(directory):
+def test_killed_compilation_does_not_block_others(directory):
     """What it leaves is no library and holds nobody up: the next one builds."""
     text = """
         import casadi as ca
@@ -683,7 +683,7 @@ def test_a_compilation_that_is_killed(directory):
 
 @POSIX
 @needs_compiler
-def test_a_fork_while_another_thread_builds(directory):
+def test_fork_during_a_build_in_another_thread(directory):
     """It holds the lock of libraries, and up to Python 3.11 that of a cached property."""
     building, forked = threading.Event(), threading.Event()
 

@@ -115,7 +115,7 @@ def test_ends_by_status_or_by_budget(compiled):
 
 
 @BOTH
-def test_a_state_that_comes_back_ends_the_solve(compiled):
+def test_repeated_state_ends_the_solve(compiled):
     """Counting to 20 and then round in fours: the first mark in the circle is the 32nd state.
 
     Begun in the circle it is the 16th, the first there is.
@@ -141,7 +141,7 @@ def test_parameters_for_all_or_for_each(compiled):
 
 
 @BOTH
-def test_nothing_to_do(compiled):
+def test_empty_batch(compiled):
     kernel = LoopKernel(counting_step(), compiled=compiled)
     none = kernel.run(np.zeros((0, 1)), [5], 10, trace=True)
     assert none.states.shape == (0, 1)
@@ -181,7 +181,7 @@ def test_non_finite_state_ends_the_loop(compiled, bad):
 
 @BOTH
 @pytest.mark.parametrize("code", [np.nan, np.inf, -np.inf, 2.0**31, -(2.0**31)])
-def test_status_that_is_no_code_ends_the_loop(compiled, code):
+def test_invalid_status_ends_the_loop(compiled, code):
     x, p = ca.SX.sym("x"), ca.SX.sym("p")
     step = step_of("no_code", ca.Function("no_code", [x, p], [x + 1, x, p]), COUNT)
     result = LoopKernel(step, compiled=compiled).run([[0]], [code], 9)
@@ -352,7 +352,7 @@ def assert_as_alone(
 @pytest.mark.parametrize("count", COUNTS)
 @pytest.mark.parametrize("step", [random_step(0), random_step(1), branching_step()])
 @LANES
-def test_as_alone(step, count):
+def test_lanes_match_single_solves(step, count):
     rng = np.random.default_rng(count)
     states, parameters = rng.normal(size=(count, 4)), rng.normal(size=(count, 2))
     batch_run = assert_as_alone(step, states, parameters, 300)
@@ -403,7 +403,7 @@ def test_stages(stages, count):
 
 @pytest.mark.parametrize("count", COUNTS)
 @LANES
-def test_every_end_beside_every_other(count):
+def test_all_statuses_in_neighbouring_lanes(count):
     """Done, repeated, not finite, out of iterations: side by side in one batch."""
     x, p = ca.SX.sym("x"), ca.SX.sym("p", 2)
     counting, exploding = x + 1, x * x * 1e30
@@ -431,7 +431,7 @@ def test_lanes_end_where_a_state_comes_back():
 
 
 @LANES
-def test_traces_of_other_lengths_than_the_last_one():
+def test_traces_longer_than_the_previous():
     """Room is made for as much as the last one needed: too much, too little, none at all."""
     kernel = LoopKernel(counting_step("lengths"))
     assert kernel.lanes > 1
@@ -444,7 +444,7 @@ def test_traces_of_other_lengths_than_the_last_one():
         assert len(ran.rows) * ran.rows.dtype.itemsize <= bytes_reserved <= MAX_FIRST_TRACE_BYTES
 
 
-def test_few_solves_wait_for_no_compiler(monkeypatch, tmp_path, lanes):
+def test_small_batches_do_not_wait_for_a_compiler(monkeypatch, tmp_path, lanes):
     """Until a library is at hand, whoever had it made."""
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
     step = dataclasses.replace(counting_step(f"few_{lanes}"), recipe="counting")

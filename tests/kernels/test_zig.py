@@ -74,7 +74,7 @@ def test_the_kernel_tests_pass(environment):
 
 
 @NEEDS_ZIG
-def test_iterates_are_those_of_any_other_compiler(environment):
+def test_iterates_match_another_compiler(environment):
     zig = python("-c", ITERATES, env=environment, text=False)
     assert zig.stderr.split()[:1] == [b"True"], zig.stderr
     usual = python("-c", ITERATES, text=False)

@@ -59,7 +59,7 @@ def whole_log(write: Write, set_chunk_size: Callable[[int], None]) -> Path:
 
 
 @pytest.mark.parametrize("seed", range(30))
-def test_a_cut_log(whole_log: Path, seed: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_cut_log_is_repaired(whole_log: Path, seed: int, caplog: pytest.LogCaptureFixture) -> None:
     """Every complete chunk is read, and the log says that it is not whole."""
     rng = np.random.default_rng(seed)
     chunks = chunks_of(whole_log)
@@ -158,7 +158,7 @@ def many_chunks(path: Path, compression: CompressionType, whose: str = "casadi_i
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_every_chunk_that_was_written_is_kept(tmp_path: Path, compression: CompressionType) -> None:
+def test_completed_chunks_are_kept(tmp_path: Path, compression: CompressionType) -> None:
     """Cut anywhere, all chunks that are whole up to there; a second repair changes nothing."""
     original = tmp_path / "whole.mcap"
     many_chunks(original, compression)
@@ -181,7 +181,7 @@ def test_every_chunk_that_was_written_is_kept(tmp_path: Path, compression: Compr
         assert path.read_bytes() == data_again
 
 
-def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+def test_log_in_use_is_left_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
         for first in range(40):
@@ -195,7 +195,7 @@ def test_a_log_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("closed", [True, False])
-def test_damage_in_the_middle_is_refused_and_nothing_changed(tmp_path: Path, closed: bool) -> None:
+def test_damage_inside_a_log_is_refused_without_change(tmp_path: Path, closed: bool) -> None:
     path = tmp_path / "log.mcap"
     many_chunks(path, CompressionType.ZSTD)
     chunk = chunks_of(path)[4]
@@ -208,7 +208,7 @@ def test_damage_in_the_middle_is_refused_and_nothing_changed(tmp_path: Path, clo
     assert path.read_bytes() == data_before
 
 
-def test_what_is_no_log(tmp_path: Path, small: bytes) -> None:
+def test_other_files_are_not_logs(tmp_path: Path, small: bytes) -> None:
     """It is neither opened nor finished nor merged."""
     files = {"empty": b"", "text": b"robot: ar10\n", "magic": MCAP0_MAGIC}
     files |= {"zeros": MCAP0_MAGIC + bytes(5000)}
@@ -443,7 +443,7 @@ def test_crafted_schemas_are_refused(
         assert line.startswith(f"casadi-ik: error: {path}: ")
 
 
-def test_terminal_escapes_in_names_are_shown_not_obeyed(
+def test_terminal_escapes_are_escaped(
     small: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with logs.McapRecorder(
@@ -524,9 +524,7 @@ def with_chunk(folder: Path, chunk: Chunk) -> Path:
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.parametrize("expected_words", [GIGABYTES, 1000])
-def test_a_chunk_that_unpacks_to_too_much_is_refused(
-    tmp_path: Path, compression: str, expected_words: int
-) -> None:
+def test_oversized_chunk_is_refused(tmp_path: Path, compression: str, expected_words: int) -> None:
     """Whether it says so or not, and whether the compressed data say so or not."""
     zeros = bytes(2**24)
     packed = {
@@ -540,7 +538,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused(
         logs.finish_log(with_chunk(tmp_path, Chunk(compression, packed, 0, 0, 0, expected_words)))
 
 
-def test_what_does_not_belong_into_a_chunk_is_refused(tmp_path: Path) -> None:
+def test_foreign_records_in_chunks_are_refused(tmp_path: Path) -> None:
     def record(opcode: Opcode, length: int) -> bytes:
         return struct.pack("<BQ", opcode, length)
 
@@ -567,7 +565,7 @@ def huge(path: Path) -> Path:
     return path
 
 
-def test_reading_repair_and_merging_refuse_the_same(write: Write, tmp_path: Path) -> None:
+def test_reading_repair_and_merging_refuse_the_same_files(write: Write, tmp_path: Path) -> None:
     path = huge(write(make_block(300), compression="zstd"))
     merged = tmp_path / "all.mcap"
     for ask in (

@@ -247,7 +247,7 @@ def test_oscillation_names_the_joints() -> None:
     assert events[0].value == pytest.approx(0.2)
 
 
-def test_a_standstill_names_the_singularity_and_the_limits_it_is_at() -> None:
+def test_stall_names_singularity_and_active_limits() -> None:
     k = np.arange(30)
     sigma = np.stack([np.full(30, 0.02), np.full(30, 0.11)], axis=1)
     layout, trace = trace_of(
@@ -272,7 +272,7 @@ def test_windows_are_checked() -> None:
 
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), counts=st.lists(st.integers(0, 40), min_size=1, max_size=5))
-def test_solves_do_not_see_each_other(seed: int, counts: list[int]) -> None:
+def test_solves_have_independent_events(seed: int, counts: list[int]) -> None:
     """A block of solves has the events of its solves, whatever stands before and after them."""
     rng = np.random.default_rng(seed)
     m = sum(counts)
@@ -298,7 +298,7 @@ def test_solves_do_not_see_each_other(seed: int, counts: list[int]) -> None:
     assert list(map(repr, batch_events)) == list(map(repr, single_events))
 
 
-def test_entries_and_leavings() -> None:
+def test_collision_entries_and_exits() -> None:
     """Two solves: one begins touching and is free twice, the other is always free."""
     form = TraceFormat(Layout.record(Field("clearance", (), "f4", "m")))
     rows = np.zeros(9, form.layout.dtype)
@@ -352,7 +352,7 @@ def test_a_log_with_a_scene(robot, tmp_path: Path) -> None:
     assert any(" and ".join(batch.closest[0]) in line for line in logs.explain(first).verdict)
 
 
-def test_why_names_what_blocks_and_that_nothing_was_checked(robot, tmp_path: Path) -> None:
+def test_explanation_names_obstacle_or_missing_check(robot, tmp_path: Path) -> None:
     cup = ik.load_grasp("cup")
     wall = {"kind": "sphere", "radius": 0.3, "xyz": cup.object_pose[:3, 3]}
     path = tmp_path / "blocked.mcap"
@@ -386,7 +386,7 @@ def logged(robot, path, q, rules=None):
     return log.iterations().rows, list(log.events(event="NEAR_SINGULAR").records())
 
 
-def test_the_least_margin_is_recorded(ar10, tmp_path):
+def test_lowest_clearance_is_recorded(ar10, tmp_path):
     q = ar10.random(np.random.default_rng(1), 1)[0]
     rows, _ = logged(ar10, tmp_path / "a.mcap", q)
     expected = [margins(ar10, row) for row in rows["q"].astype(float)]
@@ -453,7 +453,7 @@ def log(request, robot, arms, tmp_path_factory) -> logs.Log:
     return logs.open(path)
 
 
-def test_each_row_with_a_configuration_has_the_values_it_should(robot, log):
+def test_recorded_values_match_recomputation(robot, log):
     """Against singular values of central differences, which know nothing of the measure."""
     rows = log.iterations().rows
     row_sample = rows[:: max(len(rows) // 12, 1)]

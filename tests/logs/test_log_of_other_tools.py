@@ -80,7 +80,7 @@ def test_a_log_without_summary_is_complete(log: Path) -> None:
     assert rows_of(copy) == rows_of(log)
 
 
-def test_message_indexes_in_another_order_are_kept(log: Path) -> None:
+def test_message_indexes_in_any_order_are_kept(log: Path) -> None:
     """A torn log whose chunks are followed by indexes of another order loses none of them."""
     builder, indexes = RecordBuilder(), list[MessageIndex]()
     builder.write(MCAP0_MAGIC)

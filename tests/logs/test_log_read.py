@@ -73,7 +73,7 @@ def test_filters_of_iterations_and_events(write: Write) -> None:
     assert set(log.events(phase="hand alignment").rows["phase"]) == {1}
 
 
-def test_only_the_chunks_asked_for_are_read(
+def test_only_requested_chunks_are_read(
     write: Write, set_chunk_size: Callable[[int], None]
 ) -> None:
     """Whatever is wrong with the others goes unnoticed."""
@@ -162,7 +162,7 @@ def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None
         logs.open(tmp_path / "only")
 
 
-def test_a_policy_keeps_what_it_says(write: Write) -> None:
+def test_policy_keeps_the_selected_solves(write: Write) -> None:
     """Totals of all; iterations and events of failed, of singular ones and of a seeded sample."""
     block = make_block(*[20] * 400)
     rows = block.rows.copy()
@@ -272,7 +272,7 @@ def rows_by_solve(log: logs.Log) -> list[tuple[int, bytes]]:
     ]
 
 
-def test_numbers_go_on_from_shard_to_shard(study: Path) -> None:
+def test_solve_numbers_continue_across_shards(study: Path) -> None:
     log = logs.open(study)
     assert log.solves().solve_id.tolist() == [0, 1, 2, 3, 4, 5]
     assert log.solves().rows["solve_id"].tolist() == [0, 1, 2, 3, 4, 5]
@@ -288,7 +288,7 @@ def test_numbers_go_on_from_shard_to_shard(study: Path) -> None:
     assert [record["shard"] for record in log.solves(solve=5).records()] == [NAMES[2]]
 
 
-def test_where_a_solve_comes_from(study: Path, tmp_path: Path) -> None:
+def test_origin_of_a_solve(study: Path, tmp_path: Path) -> None:
     """In the folder as in what was merged from it, and in what was merged from that."""
     merged = logs.merge_logs([study], tmp_path / "all.mcap").path
     other_block = make_block(7, method="hand-first")
@@ -333,7 +333,7 @@ def test_a_study_is_merged(study: Path, tmp_path: Path) -> None:
     assert messages == sorted(messages)
 
 
-def test_numbers_that_are_used_once_stay(write: Write, tmp_path: Path) -> None:
+def test_unique_numbers_are_kept(write: Write, tmp_path: Path) -> None:
     write(make_block(5, first=3), make_block(5, first=9), name="a.mcap")
     write(make_block(6, first=5), name="b.mcap")
     for log in (
@@ -345,7 +345,7 @@ def test_numbers_that_are_used_once_stay(write: Write, tmp_path: Path) -> None:
         assert logs.one_solve(log, 5).number == 5
 
 
-def test_the_same_solve_is_never_counted_twice(study: Path) -> None:
+def test_duplicate_solve_is_counted_once(study: Path) -> None:
     """A merged log beside its shards, whatever numbers it has."""
     logs.merge_logs(study, study / "all.mcap")
     with pytest.raises(errors.LogError, match=r"00000\.mcap:.*1.*enhanced-dls.*all\.mcap"):
@@ -370,7 +370,7 @@ def test_shards_with_channels_in_another_order_are_merged(write: Write, tmp_path
 
 
 @pytest.mark.parametrize("head", ["empty", "magic", "header", "metadata"])
-def test_a_shard_in_which_nothing_is_whole_is_named_and_left_out(
+def test_shard_without_complete_chunk_is_named_and_skipped(
     study: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, head: str
 ) -> None:
     data = (study / NAMES[0]).read_bytes()
@@ -388,9 +388,7 @@ def test_a_shard_in_which_nothing_is_whole_is_named_and_left_out(
         logs.open(torn)
 
 
-def test_a_shard_of_which_something_is_whole_is_read_or_finished_first(
-    study: Path, tmp_path: Path
-) -> None:
+def test_partial_shard_is_read_or_repaired_first(study: Path, tmp_path: Path) -> None:
     shard = study / NAMES[1]
     shard.write_bytes(shard.read_bytes()[:-10])
     assert len(logs.open(study).solves()) == 6
@@ -400,7 +398,7 @@ def test_a_shard_of_which_something_is_whole_is_read_or_finished_first(
     assert logs.merge_logs(study, tmp_path / "all.mcap").solves == {"enhanced-dls": 6}
 
 
-def test_the_command_line_names_the_shard_of_a_solve(
+def test_command_line_names_the_shard(
     study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (study / "empty.mcap").write_bytes(b"")
@@ -415,7 +413,7 @@ def test_the_command_line_names_the_shard_of_a_solve(
     assert NAMES[1] in "".join(capsys.readouterr().out.split())
 
 
-def test_a_motion_is_read_back_or_refused(tmp_path: Path) -> None:
+def test_motion_round_trips_or_is_refused(tmp_path: Path) -> None:
     robot, path = ik.load_robot("kuka_lwr_barrett"), tmp_path / "way.mcap"
     rng = np.random.default_rng(0)
     times, q = 0.1 * np.arange(5), robot.random(rng, 5)

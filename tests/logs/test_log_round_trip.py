@@ -68,7 +68,7 @@ def assert_solves(table: logs.Table, block: SolveBlock) -> None:
 
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
-def test_own_reader_gives_the_same_bits(write: Write, compression: str) -> None:
+def test_reader_gives_the_same_bits(write: Write, compression: str) -> None:
     blocks = [make_block(50, 1, 7), make_block(400, first=7)]
     log = logs.open(write(*blocks, compression=compression))
     iterations = log.iterations()
@@ -259,7 +259,7 @@ def test_the_layout_comes_back_from_the_schema(layout: Layout) -> None:
         "uint8 a # []\nfloat64 b # []",
     ],
 )
-def test_lines_that_are_no_part_of_a_layout_are_refused(line: str) -> None:
+def test_invalid_layout_lines_are_refused(line: str) -> None:
     with pytest.raises(errors.LogError, match="schema: "):
         parse_layout(f"{line}\n")
 
@@ -274,7 +274,7 @@ def test_lines_that_are_no_part_of_a_layout_are_refused(line: str) -> None:
         Layout((Field("a", (0,)),)),
     ],
 )
-def test_layouts_that_are_no_message(layout: Layout) -> None:
+def test_invalid_layouts_are_refused(layout: Layout) -> None:
     with pytest.raises(errors.LogError):
         schema_text(layout)
 
@@ -330,7 +330,7 @@ def test_a_solve_is_repeated_from_its_log(tmp_path: Path, limits: str) -> None:
     assert not np.allclose(limited_solution.q, first.q, atol=1e-3)
 
 
-def test_held_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
+def test_fixed_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
     block = make_block(3)
     fixed = np.full(40, np.nan)
     fixed[[1, 33]] = 0.5, -0.25

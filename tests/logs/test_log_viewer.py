@@ -89,9 +89,7 @@ def test_iterations_are_those_of_the_log(decoded: Decoded, solve: logs.SolveReco
         np.testing.assert_array_equal(values, solve.rows[name])
 
 
-def test_contacts_turn_green_when_they_are_reached(
-    decoded: Decoded, solve: logs.SolveRecord
-) -> None:
+def test_reached_contacts_turn_green(decoded: Decoded, solve: logs.SolveRecord) -> None:
     def green(message: Any) -> list[bool]:
         return [entity.arrows[0].color.g > 0.5 for entity in message.entities]
 
@@ -111,7 +109,7 @@ def test_contacts_turn_green_when_they_are_reached(
         np.testing.assert_allclose(pose[:3, [3, 0]].T, [point, normal], atol=1e-12)
 
 
-def test_messages_tell_the_story(decoded: Decoded, solve: logs.SolveRecord) -> None:
+def test_messages_describe_the_solve(decoded: Decoded, solve: logs.SolveRecord) -> None:
     lines = [message.message for _, message in decoded.topics["/ik/messages"]]
     assert lines[0] == "enhanced-dls on kuka_lwr_barrett, solve 1"
     assert "thumb-reaching" in lines

@@ -24,7 +24,7 @@ def values(text: str) -> list[float]:
     ]
 
 
-def test_a_dip_without_a_threshold_is_told_against_the_median() -> None:
+def test_dip_without_threshold_is_compared_with_the_median() -> None:
     rows = make_rows()
     rows["sigma_closed_chain"][:20] = np.nan
     rows["sigma_closed_chain"][33] = 0.004
@@ -39,7 +39,7 @@ def test_a_dip_without_a_threshold_is_told_against_the_median() -> None:
     assert values(line) == []
 
 
-def test_a_finger_that_was_there_and_left() -> None:
+def test_finger_that_lost_its_contact() -> None:
     rows = make_rows()
     rows["position_error"], rows["angle_error"] = 0.001, 0.0
     rows["angle_error"][31:, 0] = 10 * DEGREE
@@ -51,7 +51,7 @@ def test_a_finger_that_was_there_and_left() -> None:
     assert values(explanation.verdict[0]) == [10.0]
 
 
-def test_who_came_last_when_it_is_solved() -> None:
+def test_last_finger_of_a_solved_target() -> None:
     rows = make_rows()
     rows["position_error"], rows["angle_error"] = 0.001, 0.0
     rows["position_error"][:22, 0] = 0.05
@@ -74,7 +74,7 @@ def test_who_came_last_when_it_is_solved() -> None:
         (0.099, [4]),
     ],
 )
-def test_a_budget_that_ran_out(end: float, expected: list[float]) -> None:
+def test_exhausted_budget(end: float, expected: list[float]) -> None:
     rows = make_rows()
     rows["angle_error"] = 0.0
     rows["position_error"][-4:] = np.linspace(0.1, end, 5)[1:, None]
@@ -96,7 +96,7 @@ def test_restless_joints_and_oscillations() -> None:
     assert explanation.incidents[2].startswith("joint_c, joint_a ")
 
 
-def test_phases_that_come_again_are_told_one_by_one_or_together() -> None:
+def test_repeated_phases_are_described() -> None:
     rows = make_rows()
     rows["phase"] = np.arange(40) // 10 % 2 + 1
     rows["position_error"][35:] = 0.02
@@ -130,7 +130,7 @@ def test_free_fingers_and_unmeasured_rows() -> None:
     assert explanation.fingers[0].startswith("thumb ")
 
 
-def test_a_free_finger_whose_errors_are_logged_as_zero_is_not_told() -> None:
+def test_free_finger_with_zero_errors_is_omitted() -> None:
     rows = make_rows()
     rows["position_error"][:, 1] = rows["angle_error"][:, 1] = 0.0
     free = np.array([0.1, np.nan])
@@ -140,7 +140,7 @@ def test_a_free_finger_whose_errors_are_logged_as_zero_is_not_told() -> None:
     )
 
 
-def test_without_a_trace_only_the_end_is_told() -> None:
+def test_without_a_trace_only_the_result_is_described() -> None:
     solve = make_one(make_rows())
     explanation = logs.explain(dataclasses.replace(solve, rows=solve.rows[:0]))
     assert [values(line) for line in explanation.verdict] == [
@@ -194,7 +194,7 @@ def test_events_in_words(occurrence, parts: tuple[str, ...]) -> None:
     assert "{" not in text
 
 
-def test_two_methods_side_by_side() -> None:
+def test_two_methods_compared() -> None:
     rows = make_rows()
     rows["position_error"][30:], rows["angle_error"][30:] = 0.001, 0.0
     rows["sigma_closed_chain"][7] = 0.03
@@ -216,7 +216,7 @@ def test_two_methods_side_by_side() -> None:
         logs.compare_solves(solved, other_solve)
 
 
-def test_targets_are_the_same_but_for_rounding() -> None:
+def test_targets_are_compared_up_to_rounding() -> None:
     rng = np.random.default_rng(0)
     points, normals = rng.normal(size=(2, 3, 3))
     normals[1] = np.nan
@@ -252,7 +252,7 @@ def failed(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> list[
     return solves
 
 
-def test_the_fingers_that_are_named_are_those_out_of_tolerance(
+def test_named_fingers_are_out_of_tolerance(
     failed: list[logs.SolveRecord],
 ) -> None:
     for solve in failed:
@@ -262,9 +262,7 @@ def test_the_fingers_that_are_named_are_those_out_of_tolerance(
         assert [line.split()[0] for line in story.verdict[: len(out)]] == out
 
 
-def test_phases_tell_the_errors_of_the_robot_in_that_posture(
-    failed: list[logs.SolveRecord], robot: ik.ArmHand
-) -> None:
+def test_phase_errors_match_the_robot(failed: list[logs.SolveRecord], robot: ik.ArmHand) -> None:
     """First and last distance of the thumb in a phase, recomputed from q."""
     thumb = robot.fingers.index(robot.thumb)
     for solve in failed:
@@ -280,7 +278,7 @@ def test_phases_tell_the_errors_of_the_robot_in_that_posture(
             assert end == pytest.approx(distance[int(last) - 1], abs=0.06)
 
 
-def test_singularities_are_where_the_singular_value_is_small(
+def test_named_singularities_have_small_singular_values(
     failed: list[logs.SolveRecord],
 ) -> None:
     count = 0
@@ -299,9 +297,7 @@ def test_singularities_are_where_the_singular_value_is_small(
     assert count
 
 
-def test_motors_at_a_limit_are_at_a_limit(
-    failed: list[logs.SolveRecord], robot: ik.ArmHand
-) -> None:
+def test_named_limits_are_active(failed: list[logs.SolveRecord], robot: ik.ArmHand) -> None:
     count = 0
     for solve in failed:
         q = solve.rows["q"]

@@ -127,7 +127,7 @@ def test_two_writers_on_one_path(tmp_path: Path) -> None:
     assert len(logs.open(path).solves()) == 0
 
 
-def test_what_was_there_stays_until_the_first_chunk(tmp_path: Path) -> None:
+def test_existing_log_is_kept_until_the_first_chunk(tmp_path: Path) -> None:
     path = tmp_path / "cup.mcap"
     path.write_bytes(b"an older log")
 
@@ -183,7 +183,7 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
     assert len(logs.open(link).solves()) == 1
 
 
-def test_blocks_that_contradict_leave_the_log_usable(tmp_path: Path) -> None:
+def test_contradictory_blocks_leave_the_log_usable(tmp_path: Path) -> None:
     path = tmp_path / "cup.mcap"
     good = make_block(5, 5)
     other_format = TraceFormat(Layout.record(Field("q", (3,))), LABELS)
@@ -272,7 +272,7 @@ def test_metadata_is_complete(write: Write) -> None:
     assert 0 < info.compressed < info.uncompressed
 
 
-def test_a_solve_of_more_iterations_than_there_is_time_for_has_its_totals(tmp_path: Path) -> None:
+def test_solve_without_room_for_iterations_has_its_totals(tmp_path: Path) -> None:
     path = tmp_path / "long.mcap"
     clock = logs.LogClock(T0, slot=5_000_000)
     with logs.McapRecorder(path, robot_name="made_up", clock=clock) as recorder:
@@ -294,7 +294,7 @@ def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("small_limit")
-def test_a_solve_that_is_too_large_leaves_the_log_usable(tmp_path: Path) -> None:
+def test_oversized_solve_leaves_the_log_usable(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     says = r"x\.mcap: method 'enhanced-dls', solve 3 holds \d{7} bytes; expected at most 6291456"
     with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
@@ -308,7 +308,7 @@ def test_a_solve_that_is_too_large_leaves_the_log_usable(tmp_path: Path) -> None
 
 
 @pytest.mark.usefixtures("small_limit")
-def test_the_largest_solve_that_is_written_is_read(tmp_path: Path) -> None:
+def test_largest_written_solve_is_readable(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     largest = 0
     for iterations in range(4000, 9000, 250):
@@ -331,7 +331,7 @@ def test_the_largest_solve_that_is_written_is_read(tmp_path: Path) -> None:
         ({"parameters": {"note": "x" * LIMIT}}, "the metadata"),
     ],
 )
-def test_what_goes_with_a_log_is_too_large(tmp_path: Path, fields: dict, says: str) -> None:
+def test_oversized_attachments_are_refused(tmp_path: Path, fields: dict, says: str) -> None:
     with pytest.raises(errors.LogError, match=rf"x\.mcap: {says}.*\d+.*6291456"):
         logs.McapRecorder(tmp_path / "x.mcap", robot_name="made_up", **fields)
     assert list(tmp_path.iterdir()) == []

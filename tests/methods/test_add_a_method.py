@@ -36,7 +36,7 @@ def targets(page):
     return page.robot.contacts(near_home(page.robot, np.random.default_rng(7), 8))
 
 
-def test_it_solves_a_batch_side_by_side(page, targets):
+def test_added_method_solves_in_lanes(page, targets):
     kernel = page.solver._engine.method.kernel
     assert not kernel.compiled or kernel.lanes > 1
     batch = page.solver.solve_batch(*targets)
@@ -45,7 +45,7 @@ def test_it_solves_a_batch_side_by_side(page, targets):
     assert page.solver.parameters["options"] == {"damping": 0.2, "max_iterations": 300}
 
 
-def test_it_is_logged_and_stepped(page, targets, tmp_path):
+def test_added_method_is_logged_and_stepped(page, targets, tmp_path):
     points, normals = (array[0] for array in targets)
     grasp = grasp_of(page.robot, points, normals)
     solution = page.solver.solve(grasp, log=tmp_path / "x.mcap")
@@ -57,7 +57,7 @@ def test_it_is_logged_and_stepped(page, targets, tmp_path):
     np.testing.assert_allclose([record["q"] for record in records], rows["q"], atol=1e-9)
 
 
-def test_a_budget_that_is_used_up_is_a_status(page, targets):
+def test_exhausted_budget_is_a_status(page, targets):
     solver = ik.Solver(page.robot, page.DampedLeastSquares.name, options={"max_iterations": 1})
     batch = solver.solve_batch(*targets)
     late = ~batch.success  # the verdict is on where the last step led
@@ -72,7 +72,7 @@ def test_a_free_finger_is_refused_by_name(page, targets):
         page.solver.solve_batch(points, normals)
 
 
-def test_names_are_taken_once(page):
+def test_method_names_are_unique(page):
     method, parameter_class = page.DampedLeastSquares, page.DampedParameters
     with pytest.raises(errors.InputError, match="name: method 'damped-least-squares'"):
         ik.register_method(method.name, "again", parameter_class, method)

@@ -51,7 +51,7 @@ def test_an_arm_without_a_closed_form(tmp_path_factory, method, tolerance, min_s
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arm", [*SINGLE, "kinova_gen3", "xarm6", "sawyer"])
-def test_the_arm_follows_at_once(arm):
+def test_arm_follows_the_hand_immediately(arm):
     """Six joints in one evaluation; an arm that is only nearly of its form is refined."""
     robot = robot_of(arm)
     q = robot.random(np.random.default_rng(7), 12)
@@ -97,7 +97,7 @@ def with_hand(robot, arms, hand):
     return np.concatenate([arms, np.tile(list(hand.values()), (len(arms), 1))], axis=1)
 
 
-def test_short_stretches_of_the_swept_joint_are_found(panda, solver):
+def test_short_intervals_of_the_swept_joint_are_found(panda, solver):
     """With six of seven joints next to their limits some are a few ten-thousandths long."""
     hand = held_hand(panda)
     q_missed = [
@@ -119,7 +119,7 @@ def test_short_stretches_of_the_swept_joint_are_found(panda, solver):
     assert np.median(used_restarts) == solver.parameters["options"]["candidates"]
 
 
-def test_a_straight_arm_that_is_nearly_in_closed_form():
+def test_nearly_closed_form_straight_arm():
     """There Newton's steps lead nowhere from the nominal arm: it is searched for."""
     robot = robot_of("kinova_gen3")
     hand = held_hand(robot)
@@ -132,7 +132,7 @@ def test_a_straight_arm_that_is_nearly_in_closed_form():
     assert solver.solve_batch(*robot.contacts(q), fixed=hand).success.all()
 
 
-def test_what_is_near_a_panda_is_found(panda, solver):
+def test_nearby_solutions_of_a_panda_are_found(panda, solver):
     q = panda.random(np.random.default_rng(4), 200)
     start = np.clip(
         q + np.random.default_rng(5).normal(scale=0.3, size=q.shape), panda.lower, panda.upper
@@ -148,7 +148,7 @@ def test_what_is_near_a_panda_is_found(panda, solver):
 
 
 @pytest.mark.parametrize("name", ["xarm6+barrett_bh8_280", "xarm6+shadow"])
-def test_what_is_near_an_arm_whose_last_joint_is_searched_is_found(name):
+def test_nearby_solutions_of_a_searched_last_joint_are_found(name):
     """A search on the branches would pass it by: it begins where the robot is."""
     robot = ik.load_robot(name)
     rng = np.random.default_rng(4)

@@ -36,7 +36,7 @@ def noisy(robot, rng, count):
     ("name", "count", "fingers"),
     [(ALL, 2000, None), ("ar10", 200, THREE), ("baxter_ar10", 200, THREE)],
 )
-def test_what_a_configuration_meets_is_solved(name, count, fingers):
+def test_reachable_underactuated_targets_are_solved(name, count, fingers):
     """Least squares alone missed 1.2, 54 and 3.4 % of them."""
     robot = ik.load_robot(name)
     points, normals = displaced(robot, np.random.default_rng(1), count, 0.98, fingers)
@@ -44,7 +44,7 @@ def test_what_a_configuration_meets_is_solved(name, count, fingers):
     assert np.flatnonzero(~batch.success).tolist() == []
 
 
-def test_limits_and_held_actuators_are_kept(robot):
+def test_limits_and_fixed_actuators_are_kept(robot):
     points, normals = noisy(robot, np.random.default_rng(3), 500)
     free = ik.Solver(robot).solve_batch(points, normals)
     balanced = np.flatnonzero((free.phases["balance"] > 0) & free.success)
@@ -64,7 +64,7 @@ def test_limits_and_held_actuators_are_kept(robot):
     assert fixed_count
 
 
-def test_alone_in_a_batch_and_in_blocks_the_answer_is_the_same(robot):
+def test_results_are_independent_of_batch_and_blocks(robot):
     solver = ik.Solver(robot)
     points, normals = noisy(robot, np.random.default_rng(5), 300)
     batch = solver.solve_batch(points, normals)
@@ -80,7 +80,7 @@ def test_alone_in_a_batch_and_in_blocks_the_answer_is_the_same(robot):
         assert solution.success == batch.success[row]
 
 
-def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(robot):
+def test_repeated_infeasible_minima_end_table_restarts(robot):
     """They took every round, and up to 60 steps of a balance, to be given up."""
     points, normals = noisy(robot, np.random.default_rng(11), 1000)
     solver = ik.Solver(robot)
@@ -98,7 +98,7 @@ def test_fits_that_come_back_to_a_minimum_that_misses_end_the_rounds_of_tables(r
     assert max(record["restart"] for record in solver.stepper(grasp)) <= given_up + 1
 
 
-def test_what_is_missed_by_far_is_not_balanced(robot):
+def test_distant_misses_are_not_balanced(robot):
     points, normals = noisy(robot, np.random.default_rng(7), 20)
     points[:, 0] += 0.5
     batch = ik.Solver(robot).solve_batch(points, normals)

@@ -102,7 +102,7 @@ ONCE_MISSED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ONCE_MISSED)
-def test_what_was_missed_once_is_solved(case):
+def test_formerly_missed_targets_are_solved(case):
     name, tolerance, fixed_joints, *rows = ONCE_MISSED[case]
     robot = ik.load_robot(name)
     solver = ik.Solver(robot, tolerance=tolerance)
@@ -128,12 +128,12 @@ def test_hands_on_many_arms(robot, solver, rng, hand, off):
     assert np.flatnonzero(~batch.success).tolist() == []
 
 
-def test_rows_that_were_lost(robot, solver):
+def test_formerly_lost_rows_are_solved(robot, solver):
     q = robot.random(np.random.default_rng(0), 1_000_000)[list(MISSED_ROWS)]
     assert solver.solve_batch(*robot.contacts(q)).success.all()
 
 
-def test_arms_at_either_end_of_nearly_a_full_turn():
+def test_arms_at_both_ends_of_nearly_a_full_turn():
     """Nearly all of those missed among corners had joints there: 17 of 10,000."""
     robot, rng = ik.load_robot("baxter_ar10"), np.random.default_rng(4)
     q, fixed_index = robot.random(rng, 500), rng.integers(0, 3, (500, len(robot.lower)))
@@ -143,7 +143,7 @@ def test_arms_at_either_end_of_nearly_a_full_turn():
     assert ik.Solver(robot, tolerance=EXACT).solve_batch(*robot.contacts(q)).success.all()
 
 
-def test_where_limits_are_ignored_hands_beyond_them_are_found(robot, rng):
+def test_hands_beyond_ignored_limits_are_found(robot, rng):
     """Tables of postures within limits miss a hundredth of them."""
     q = robot.random(rng, 2000)
     q[:, 7:] += rng.uniform(-1, 1, (2000, 7))

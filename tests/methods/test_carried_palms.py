@@ -41,7 +41,7 @@ def test_trunk_and_arms_carry_the_palms_and_hands_stay(setup) -> None:
     np.testing.assert_array_equal(ends[:, hands], q[:, hands])
 
 
-def test_arms_are_placed_for_the_trunk_as_it_is(setup) -> None:
+def test_arms_are_placed_for_the_current_trunk(setup) -> None:
     robot, trials, targets, q = setup
     arms = carrying(robot)[len(robot.description.trunk_actuators) :]
     starts, palms = q.copy(), side_palms(robot, q)

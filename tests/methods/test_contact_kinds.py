@@ -94,7 +94,7 @@ def solvers(robot):
     return {name: ik.Solver(robot, name, TIGHT, compiled=False) for name in METHODS}
 
 
-def test_contact_frames_are_pinocchios(robot, coupled_robot, oracle, coupled_oracle, rng):
+def test_contact_frames_match_pinocchio(robot, coupled_robot, oracle, coupled_oracle, rng):
     for model, model_oracle in ((robot, oracle), (coupled_robot, coupled_oracle)):
         for q in model.random(rng, 5):
             np.testing.assert_allclose(
@@ -132,7 +132,7 @@ def test_every_kind_is_solved(robot, oracle, solvers, method, kind):
         ("thumb-first", ik.Tolerance(), 0.93),
     ],
 )
-def test_what_is_free_has_no_rows(robot, rng, method, tolerance, min_solved, free):
+def test_free_components_have_no_rows(robot, rng, method, tolerance, min_solved, free):
     """Solved, and the log measures nothing of it."""
     points, normals = robot.contacts(robot.random(rng, 120))
     rows, finger = np.arange(120), rng.integers(0, 3, 120)
@@ -165,7 +165,7 @@ def test_what_is_free_has_no_rows(robot, rng, method, tolerance, min_solved, fre
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_whole_poses_of_all_fingers(robot, oracle, solvers, method):
+def test_full_poses_of_all_fingers(robot, oracle, solvers, method):
     """More is asked than the hand has joints for, so from the configuration that has them."""
     at = frames(robot)
     contacts = dict(zip(robot.fingers, (contact("pose", frame) for frame in at), strict=True))
@@ -176,7 +176,7 @@ def test_whole_poses_of_all_fingers(robot, oracle, solvers, method):
 
 
 @pytest.mark.parametrize("method", PAPER)
-def test_the_papers_methods_say_what_they_need(robot, method):
+def test_paper_methods_name_their_requirements(robot, method):
     points, normals, tangents = (frames(robot)[None, :, :3, i] for i in (3, 0, 1))
     solver = ik.Solver(robot, method, finger_step="closed-form", compiled=False)
     with pytest.raises(ik.errors.RowError, match=r"row 0 .*'thumb'"):
@@ -186,7 +186,7 @@ def test_the_papers_methods_say_what_they_need(robot, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_target_has_the_same_answer_in_any_company(robot, solvers, method):
+def test_answers_are_independent_of_other_targets(robot, solvers, method):
     """Its own kinds decide which kernel solves it, and its number the random numbers."""
     at = np.array([frames(robot, seed) for seed in range(4)])
     points, normals, tangents = at[..., :3, 3], at[..., :3, 0], at[..., :3, 1].copy()
@@ -208,7 +208,7 @@ def test_a_target_has_the_same_answer_in_any_company(robot, solvers, method):
         assert answer.iterations[0] == batch.iterations[i]
 
 
-def test_a_batch_may_hold_directions_alone(robot, solvers):
+def test_batch_of_directions_only(robot, solvers):
     """Beside points and normals, with the answers that grasps get; the thumb's point is free."""
     at = np.array([frames(robot, seed) for seed in range(3)])
     points, normals = at[..., :3, 3].copy(), at[..., :3, 0].copy()
@@ -251,7 +251,7 @@ def test_rows_of_a_log_belong_to_their_solves(robot, solvers, tmp_path: Path):
             np.testing.assert_allclose(solve.target_more["tangents"], tangents[i], atol=1e-15)
 
 
-def test_what_was_asked_stands_in_the_log(robot, solvers, tmp_path: Path):
+def test_log_contains_the_targets(robot, solvers, tmp_path: Path):
     """And asked again it has the same answer."""
     kinds = dict(zip(robot.fingers, ("plane and pose", "line", "direction"), strict=True))
     grasp = ik.Grasp(
@@ -295,7 +295,7 @@ def test_what_was_asked_stands_in_the_log(robot, solvers, tmp_path: Path):
     assert second.status == first.status
 
 
-def test_why_a_pose_is_not_solved(robot, oracle, solvers):
+def test_unsolved_pose_is_explained(robot, oracle, solvers):
     """The diagnosis asks with tangents as well: what helps is to leave one free."""
     at = frames(robot)
     normals, tangents = at[:, :3, 0], at[:, :3, 1].copy()
@@ -396,7 +396,7 @@ def test_bad_arrays(robot, solvers):
         solver.solve_batch(points, normals, tangents=tangents[..., 0])
 
 
-def test_no_proof_counts_a_contact_that_may_slide(robot, solvers):
+def test_sliding_contacts_give_no_proof(robot, solvers):
     """Its point is far out of reach; the plane through it is not."""
     at = frames(robot)
     far_point = at[0, :3, 3] + [5.0, 5.0, 0.0]

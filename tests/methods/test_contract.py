@@ -147,7 +147,7 @@ def test_fields_of_a_batch(case):
     np.testing.assert_array_equal(row.q, batch.q[k - 1])
 
 
-def test_success_is_what_pinocchio_says(case):
+def test_success_matches_pinocchio(case):
     """The verdict recomputed from q alone through the written URDF, both readings of limits."""
     oracle = PinocchioRobot(case.robot)
     for limits in ("enforce", "ignore"):
@@ -185,7 +185,7 @@ def test_a_batch_is_its_single_solves(case):
             np.testing.assert_array_equal(whole_batch.q[row], single_batch.q[0])
 
 
-def test_a_batch_goes_side_by_side(case):
+def test_lanes_match_single_solves(case):
     """No line of any method's code is refused by the rewriting, and on one robot it is run."""
     options = {"finger_step": "closed-form"} if case.method.startswith("enhanced") else {}
     kernel = getattr(
@@ -205,7 +205,7 @@ def test_a_batch_goes_side_by_side(case):
         fields_equal(batch, single_batch, slice(row, row + 1))
 
 
-def test_threads_change_nothing(case):
+def test_threads_do_not_change_results(case):
     solver = case.solver()
     sequential = solver.solve_batch(case.points, case.normals, jobs=1, seed=1)
     fields_equal(sequential, solver.solve_batch(case.points, case.normals, jobs=2, seed=1))
@@ -230,7 +230,7 @@ def test_starts_row_by_row(case):
     np.testing.assert_array_equal(q0_before[0], q0[0], "starts are not written to")
 
 
-def test_a_start_that_solves_already_is_the_answer(case):
+def test_solved_start_is_returned(case):
     """But for the paper's methods, which stand as the paper has them: they begin by moving."""
     if case.method in PAPER:
         pytest.skip("the paper's method reaches with the thumb first, wherever it is")
@@ -247,7 +247,7 @@ def test_an_empty_batch(case):
     assert batch.q.shape == (0, len(case.robot.actuators))
 
 
-def test_unreachable_contacts_are_a_status(case):
+def test_unreachable_contacts_have_a_status(case):
     # It begins anew fifty times before it gives up; what it says then shows after three.
     options = {"options": {"restarts": 3}} if case.method == "ipopt" else {}
     solver = case.solver(**options)
@@ -257,7 +257,7 @@ def test_unreachable_contacts_are_a_status(case):
     assert np.all(np.isfinite(solution.q))
 
 
-def test_a_log_changes_no_number(case, tmp_path):
+def test_logging_does_not_change_results(case, tmp_path):
     solver = case.solver()
     path = tmp_path / "solve.mcap"
     for count in (1, len(case.points)):  # alone, and side by side
@@ -280,7 +280,7 @@ def test_a_log_changes_no_number(case, tmp_path):
     assert parameters["limits"] == "enforce"
 
 
-def test_bad_input_leaves_no_log(case, tmp_path):
+def test_bad_input_creates_no_log(case, tmp_path):
     path = tmp_path / "solve.mcap"
     with pytest.raises(ik.errors.InputError):
         case.solver().solve_batch(case.points, case.normals, q0=[1.0], log=path)
@@ -308,7 +308,7 @@ def test_bad_arguments(case, change, says):
     assert "\n" not in str(caught.value)
 
 
-def test_starts_as_many_as_targets(case):
+def test_number_of_starts_must_match_targets(case):
     q0 = np.tile(case.robot.home, (3, 1))
     with pytest.raises(ik.errors.InputError, match=r"q0:.*3.*8"):
         case.solver().solve_batch(case.points, case.normals, q0=q0)
@@ -317,14 +317,14 @@ def test_starts_as_many_as_targets(case):
         case.solver().solve_batch(case.points[:3], case.normals[:3], q0=q0)
 
 
-def test_a_grasp_of_another_hand(case):
+def test_grasp_of_another_hand_is_refused(case):
     with pytest.raises(ik.errors.InputError, match=r"contacts\.pinky:.*fingers: "):
         case.solver().solve(ik.Grasp({"pinky": ik.Contact([0, 0, 1])}))
     with pytest.raises(ik.errors.InputError, match=r"grasp:.*Grasp"):
         case.solver().solve("cup")
 
 
-def test_parameters_say_everything(case):
+def test_parameters_are_complete(case):
     parameters = case.solver().parameters
     assert parameters["method"] == case.method
     assert parameters["tolerance"] == {
@@ -414,7 +414,7 @@ def test_bad_options(robot, method, options, says):
     assert "\n" not in str(caught.value)
 
 
-def test_a_name_is_no_robot():
+def test_robot_name_is_not_a_robot():
     with pytest.raises(ik.errors.InputError, match=r"robot:.*'kuka_lwr_barrett'.*load_rob"):
         ik.Solver("kuka_lwr_barrett")
 

@@ -37,7 +37,7 @@ def test_without_limits_everything_is_solved_too(robot, rng):
     assert solver.solve_batch(*robot.contacts(near_limits(robot, rng, 200))).success.all()
 
 
-def test_out_of_reach_the_contacts_come_near(robot, exact, rng):
+def test_unreachable_contacts_are_approached(robot, exact, rng):
     """Not solved; what comes back is finite, within limits and stretched towards the target."""
     points, normals = robot.contacts(robot.random(rng, 20))
     offsets = points.mean(axis=1, keepdims=True)
@@ -73,7 +73,7 @@ def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.045], ids=["closed form", "none"])
-def test_without_a_compiler_a_round_is_the_same(tmp_path, rng, offset):
+def test_uncompiled_restart_is_the_same(tmp_path, rng, offset):
     robot = derived_robot(tmp_path, wrist_offset=offset)
     q, usual = robot.random(rng, 25), ik.Tolerance()
     points, normals = robot.contacts(q)
@@ -97,7 +97,7 @@ def test_without_a_compiler_a_round_is_the_same(tmp_path, rng, offset):
 
 
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
-def test_what_is_out_of_reach_ends_the_same_alone_and_in_a_batch(ar10, rng, prefer):
+def test_unreachable_targets_end_the_same_alone_and_in_a_batch(ar10, rng, prefer):
     """All rounds are made for it."""
     points, normals = ar10.contacts(ar10.random(rng, 6))
     points = points + rng.normal(0, 0.008, points.shape)

@@ -27,7 +27,7 @@ def all_solved(
     ("method", "limits", "min_solved"),
     [("hand-first", "enforce", 1), ("hand-first", "ignore", 1), ("thumb-first", "enforce", 0.9)],
 )
-def test_every_motor_may_be_held(robot, rng, method, limits, min_solved):
+def test_every_motor_can_be_fixed(robot, rng, method, limits, min_solved):
     tolerance = ik.Tolerance(1e-6, 1e-6) if method == "hand-first" else ik.Tolerance()
     solver = ik.Solver(robot, method, tolerance, limits=limits)
     for i, name in enumerate(robot.actuators):
@@ -48,19 +48,19 @@ def test_every_motor_may_be_held(robot, rng, method, limits, min_solved):
         ("xarm7+trifinger", {"xarm7_joint_1": 4.2, "xarm7_joint_3": 4.2, "xarm7_joint_5": -5.1}),
     ],
 )
-def test_a_joint_may_be_held_in_another_turn(name, fixed, prefer):
+def test_joint_can_be_fixed_in_another_turn(name, fixed, prefer):
     """A form of the arm gives each joint in the middle turn of its range."""
     assert all_solved(ik.load_robot(name), fixed, prefer)
 
 
 @pytest.mark.parametrize("value", [np.pi, -np.pi])
-def test_a_joint_may_be_held_where_two_turns_meet(value):
+def test_joint_can_be_fixed_at_the_turn_border(value):
     robot = ik.load_robot("ur10e+robotiq_3f")
     assert all_solved(robot, {"ur10e_joint_1": value, "ur10e_joint_5": value / 2})
 
 
 @pytest.mark.parametrize("compiled", [True, False])
-def test_the_turn_it_is_held_in_costs_neither_alternatives_nor_free_answers(compiled):
+def test_fixed_turn_keeps_alternatives_and_collision_free_answers(compiled):
     robot = ik.load_robot("ur10e+robotiq_3f")
     solver = ik.Solver(robot, compiled=compiled)
     free = ik.Solver(robot, scene=ik.load_scene("table"), compiled=compiled)
@@ -80,7 +80,7 @@ def test_the_turn_it_is_held_in_costs_neither_alternatives_nor_free_answers(comp
 
 
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
-def test_a_joint_of_an_arm_with_two_spheres_may_be_held_in_another_turn(tmp_path, prefer):
+def test_two_sphere_arm_joint_can_be_fixed_in_another_turn(tmp_path, prefer):
     path = copy_shipped_robot(tmp_path)
     with edited(tmp_path / "arm.yaml") as arm:
         for joint in (arm["joints"][0], arm["joints"][6]):
@@ -89,7 +89,7 @@ def test_a_joint_of_an_arm_with_two_spheres_may_be_held_in_another_turn(tmp_path
 
 
 @pytest.mark.parametrize("joints", [5, 3])
-def test_short_arms_and_wrists_are_placed_at_once(tmp_path, joints):
+def test_short_arms_and_wrists_are_placed_immediately(tmp_path, joints):
     """They bring a palm where it is asked for by chance only: what is near is good enough."""
     robot = ik.load_robot(part_of_the_arm(tmp_path, slice(joints)))
     q = robot.random(np.random.default_rng(6), 25)

@@ -142,14 +142,14 @@ def questions(tmp_path_factory) -> Callable[[str], tuple[Questions, Questions]]:
         for call in calls
     ],
 )
-def test_answers_do_not_depend_on_the_pose_of_the_base(questions, name, call):
+def test_answers_are_invariant_to_the_base_pose(questions, name, call):
     answers, moved_answers = (getattr(robot, call)() for robot in questions(name))
     assert answers.shape == moved_answers.shape
     # Rounding decides between arms that score alike.
     assert np.isclose(answers, moved_answers, atol=1e-5).all(axis=1).mean() >= 0.75
 
 
-def test_two_arms_stand_on_places_of_a_moved_base(tmp_path):
+def test_two_arms_on_a_moved_base(tmp_path):
     """Sides that are placed by `at` are solved wherever their places are."""
     text = PAIR.replace("[0, 0.3, 0]", "[0.2, 0.3, 0.7], rpy: [0.3, 0.2, 1]")
     path = tmp_path / "pair.yaml"

@@ -43,7 +43,7 @@ def misses(robot, q, points):
 
 
 @pytest.mark.parametrize("is_near_home", [False, True])
-def test_what_is_reachable_is_solved(robot, is_near_home):
+def test_reachable_targets_are_solved(robot, is_near_home):
     _, points, normals = targets(robot, 300, is_near_home)
     for tolerance in (ik.Tolerance(), FINE):
         batch = ik.Solver(robot, tolerance=tolerance).solve_batch(points, normals)
@@ -84,7 +84,7 @@ def test_a_hand_without_contacts_stays(robot):
         np.testing.assert_array_equal(solution.q[motors], robot.home[motors])
 
 
-def test_what_is_near_is_preferred(robot):
+def test_nearby_solutions_are_preferred(robot):
     rng = np.random.default_rng(5)
     span = robot.upper - robot.lower
     q = robot.lower + (0.3 + 0.4 * rng.random(len(span))) * span
@@ -96,7 +96,7 @@ def test_what_is_near_is_preferred(robot):
 
 
 @pytest.mark.parametrize("name", ["two_pandas+allegro", "g1+dex3"])
-def test_what_touches_nothing_is_found(name):
+def test_self_collision_free_solutions_are_found(name):
     """Fingers of a hand touch each other, arms each other, and a hand the body."""
     robot = ik.load_robot(name)
     solver, any_grasp, q_touching = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home), []
@@ -116,7 +116,7 @@ def test_what_touches_nothing_is_found(name):
     assert (solver.check(first, any_grasp).distance < 0).mean() > 0.1
 
 
-def test_hands_that_touch_themselves_are_moved_within_tolerances():
+def test_self_touching_hands_move_within_tolerance():
     """Of contacts of random postures, most of which touch something, many can be met freely."""
     robot = ik.load_robot("g1+dex3")
     solver, any_grasp = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home)
@@ -128,7 +128,7 @@ def test_hands_that_touch_themselves_are_moved_within_tolerances():
     assert misses(robot, batch.q, points)[batch.success].max() <= 5e-3 * 1.001
 
 
-def test_manipulability_is_that_of_the_worst_arm(robot):
+def test_manipulability_is_the_minimum_over_arms(robot):
     q = targets(robot, 1)[0][0]
     solutions = ik.Solver(robot).solve_all(grasp(robot, q), limit=3, prefer="manipulability")
     scores = [solution.manipulability for solution in solutions]
@@ -156,7 +156,7 @@ def measure(robot, q, side, arm):
     return np.prod(np.linalg.svd(np.array(columns), compute_uv=False)[:6])
 
 
-def test_motors_are_held(robot):
+def test_motors_can_be_fixed(robot):
     q = targets(robot, 1, seed=3)[0][0]
     names = [*robot.description.trunk, robot.description.sides[0].hand[0]]
     fixed = {name: float(q[robot.description.actuator_index(name)]) for name in names}
@@ -167,7 +167,7 @@ def test_motors_are_held(robot):
 
 
 @pytest.mark.parametrize("name", ["g1+dex3", "h1_2+inspire"])
-def test_what_is_just_out_of_reach_is_given_up_soon(name):
+def test_barely_unreachable_targets_end_early(name):
     robot = ik.load_robot(name)
     side = [robot.fingers.index(finger) for finger in robot.description.sides[0].fingers]
     _, points, normals = targets(robot, 4)
@@ -179,7 +179,7 @@ def test_what_is_just_out_of_reach_is_given_up_soon(name):
     assert np.median(batch.iterations) < 150_000
 
 
-def test_what_is_far_away_is_given_up_at_once(robot):
+def test_distant_targets_end_immediately(robot):
     """Also where contacts leave palms a freedom, and of one arm on a trunk."""
     _, points, normals = targets(robot, 4)
     batch = ik.Solver(robot).solve_batch(points + np.array([3.0, 0.0, 0.0]), normals)
@@ -187,7 +187,7 @@ def test_what_is_far_away_is_given_up_at_once(robot):
     assert batch.iterations.max() < 120_000
 
 
-def test_what_is_out_of_reach_is_told(robot):
+def test_unreachable_targets_are_diagnosed(robot):
     q = targets(robot, 1)[0][0]
     far_contacts = {
         finger: ik.Contact(np.asarray(contact.point) + 5.0, contact.normal)
@@ -200,7 +200,7 @@ def test_what_is_out_of_reach_is_told(robot):
     assert not any(worst.ok for worst in solution.diagnosis.sides.values())
 
 
-def test_the_side_that_cannot_is_named():
+def test_unreachable_side_is_named():
     robot = ik.load_robot("g1+dex3")
     contacts = grasp(robot, robot.home).contacts
     far_contacts = {
@@ -224,7 +224,7 @@ def test_without_a_compiler_there_is_an_answer():
 
 
 @pytest.mark.parametrize("method", sorted({*ik.METHODS} - {"hand-first", "ipopt"}))
-def test_the_papers_methods_say_what_they_need(method):
+def test_paper_methods_name_their_requirements(method):
     with pytest.raises(ik.errors.UnsupportedError, match=f"^{method} {ONE_HAND}"):
         ik.Solver(ik.load_robot("g1+dex3"), method)
 
@@ -255,7 +255,7 @@ def test_palms_are_given_by_side(robot):
         np.testing.assert_array_equal(ik.Solver(robot).solve(palm_only).q, solution.q)
 
 
-def test_one_palm_alone_leaves_the_other_arm():
+def test_single_palm_leaves_the_other_arm():
     robot = ik.load_robot("g1+dex3")
     q = robot.home + 0.02
     solution = ik.Solver(robot).solve(palm_grasp(robot, q, ["left"]), q0=robot.home)
@@ -264,7 +264,7 @@ def test_one_palm_alone_leaves_the_other_arm():
     assert np.allclose(solution.q[right], robot.home[right])
 
 
-def test_palms_that_cannot_be_are_refused():
+def test_inconsistent_palms_are_refused():
     robot = ik.load_robot("g1+dex3")
     solver, palm_of_left = ik.Solver(robot), palm_grasp(robot, robot.home, ["left"])
     with pytest.raises(ik.errors.InputError, match=r"palm\.middle:.*side.*left"):
@@ -293,7 +293,7 @@ def held_box(robot):
     return grasp_of(robot, points - middle, normals), middle
 
 
-def test_an_object_is_found_where_both_hands_reach_it():
+def test_free_object_is_placed_within_reach_of_both_hands():
     robot = ik.load_robot("g1+dex3")
     box, middle = held_box(robot)
     low, high = middle - np.array([0.3, 0.3, 0.3]), middle + np.array([0.4, 0.2, 0.3])
@@ -308,7 +308,7 @@ def test_an_object_is_found_where_both_hands_reach_it():
     assert misses(robot, solution.q, points).max() <= 5e-3
 
 
-def test_an_object_that_nobody_reaches_is_told():
+def test_unreachable_object_is_diagnosed():
     robot = ik.load_robot("g1+dex3")
     box, _ = held_box(robot)
     far_pose = ik.Free([3, 0, 0, 0, 0, 0], [4, 1, 1, 0, 0, 1])
@@ -317,7 +317,7 @@ def test_an_object_that_nobody_reaches_is_told():
     assert np.allclose(solution.object_pose[:3, 3], [3.5, 0.5, 0.5])
 
 
-def test_bounds_of_an_object_that_cannot_be_are_refused():
+def test_impossible_object_bounds_are_refused():
     robot = ik.load_robot("g1+dex3")
     box, _ = held_box(robot)
     with pytest.raises(ik.errors.InputError, match=r"lower: .*\[0\.0, 0\.0, 0\.0\]"):
@@ -339,7 +339,7 @@ def near_home(robot):
 
 
 @pytest.mark.parametrize("sides", [("left", "right"), ("left",)])
-def test_hands_come_close_and_lift_together(sides):
+def test_hands_approach_and_lift_together(sides):
     pytest.importorskip("toppra")
     robot = ik.load_robot("g1+dex3")
     fingers = [name for name in robot.fingers if name.startswith(sides)]
@@ -367,7 +367,7 @@ def test_a_body_is_drawn(tmp_path):
 
 
 @pytest.mark.parametrize("call", ["solve_palms", "grasps_of", "place"])
-def test_what_needs_one_hand_says_so(call):
+def test_single_hand_calls_refuse_bodies(call):
     solver = ik.Solver(ik.load_robot("g1+dex3"))
     q, pose = solver.robot.home, np.eye(4)
     calls = {
@@ -382,7 +382,7 @@ def test_what_needs_one_hand_says_so(call):
         calls[call]()
 
 
-def test_a_side_by_itself_is_an_arm_hand():
+def test_side_alone_is_an_arm_hand():
     body = ik.load_robot("mobile_kuka_lwr_barrett")
     (name,) = body.sides
     side = body.side(name)
@@ -398,7 +398,7 @@ def test_a_side_by_itself_is_an_arm_hand():
         body.side("middle")
 
 
-def test_a_side_leaves_the_others_out():
+def test_solving_a_side_leaves_the_others():
     body = ik.load_robot("g1+dex3")
     assert body.sides == ("left", "right")
     left = body.side("left")

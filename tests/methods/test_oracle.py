@@ -29,7 +29,7 @@ SETS += [
 
 @pytest.mark.parametrize("tolerance", TOLERANCES, ids=str)
 @pytest.mark.parametrize(("name", "sampler", "count", "fingers"), SETS)
-def test_all_are_solved_and_every_answer_is_right(name, sampler, count, fingers, tolerance):
+def test_targets_are_solved_and_answers_verified(name, sampler, count, fingers, tolerance):
     robot = ik.load_robot(name)
     q = SAMPLERS[sampler][1](robot, np.random.default_rng(31), count)
     assert numpy_oracle.beyond_limits(robot, q).max() <= 1e-9

@@ -42,7 +42,7 @@ def bent(robot, rng, count):
 
 
 @pytest.mark.parametrize("hands", [shipped_hands, bent])
-def test_one_start_is_nearly_always_enough(robot, single_start, rng, hands):
+def test_single_start_usually_suffices(robot, single_start, rng, hands):
     batch = single_start.solve_batch(*robot.contacts(hands(robot, rng, 600)))
     assert batch.success.mean() >= 0.995
     assert batch.limits_ok.all()
@@ -58,7 +58,7 @@ def test_one_start_is_nearly_always_enough(robot, single_start, rng, hands):
         (ik.ArmHand.random, EXACT, 0.98),
     ],
 )
-def test_other_starts_do_the_rest(robot, rng, hands, tolerance, min_solved):
+def test_restarts_solve_the_others(robot, rng, hands, tolerance, min_solved):
     solver = thumb_first(robot, tolerance)
     batch = solver.solve_batch(*robot.contacts(hands(robot, rng, 300)))
     assert batch.success.mean() >= min_solved
@@ -70,7 +70,7 @@ def test_limits_ignored(robot, rng):
     assert batch.success.all()
 
 
-def test_the_nearest_of_what_is_seen(robot, solver, rng):
+def test_nearest_solution_is_chosen(robot, solver, rng):
     """It moved as far as without a start, and from some solved nothing."""
     q, q0 = robot.random(rng, 400), robot.random(rng, 400)
     targets = robot.contacts(q)
@@ -90,7 +90,7 @@ def test_the_nearest_of_what_is_seen(robot, solver, rng):
     assert np.median(np.abs((close_batch.q - close) / ranges).max(axis=1)) < 0.05
 
 
-def test_contacts_that_contradict_each_other_a_little_are_balanced(robot, solver, rng):
+def test_slightly_inconsistent_contacts_are_balanced(robot, solver, rng):
     """71 % of them were solved."""
     points, normals = robot.contacts(robot.random(rng, 500))
     points = points + rng.normal(0, 4e-3, points.shape)
@@ -101,7 +101,7 @@ def test_contacts_that_contradict_each_other_a_little_are_balanced(robot, solver
     assert batch.limits_ok.all()
 
 
-def test_out_of_reach_the_best_is_kept(robot, solver, rng):
+def test_unreachable_targets_keep_the_best(robot, solver, rng):
     points, normals = robot.contacts(robot.random(rng, 10))
     batch = solver.solve_batch(points + np.array([3.0, 0, 0]), normals)
     assert not batch.success.any()
@@ -121,14 +121,14 @@ def test_the_start_chooses_between_hands(robot, single_start, rng):
     assert np.median(from_truth) < np.median(from_home)
 
 
-def test_without_an_arm_the_palm_is_fixed(coupled_robot, rng):
+def test_palm_is_fixed_without_an_arm(coupled_robot, rng):
     q = coupled_robot.random(rng, 100)
     batch = thumb_first(coupled_robot).solve_batch(*coupled_robot.contacts(q))
     assert batch.success.mean() >= 0.95
     assert not batch.phases["arm-placement"].any()
 
 
-def test_proxqp_solves_as_well(robot, single_start, rng):
+def test_proxqp_solves_equally_well(robot, single_start, rng):
     """The quadratic program takes the same way: nothing is lost by fixing joints one by one."""
     targets = robot.contacts(shipped_hands(robot, rng, 60))
     program = thumb_first(robot, starts=1, step="proxqp")
@@ -139,7 +139,7 @@ def test_proxqp_solves_as_well(robot, single_start, rng):
 
 
 @pytest.mark.parametrize("joints", [1, 3, 4])
-def test_thumbs_of_any_number_of_joints(tmp_path, rng, joints):
+def test_thumbs_with_any_number_of_joints(tmp_path, rng, joints):
     robot = thumb_of(tmp_path, joints)
     solver = thumb_first(robot, compiled=False, starts=8)
     batch = solver.solve_batch(*robot.contacts(robot.random(rng, 20)))

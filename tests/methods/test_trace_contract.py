@@ -91,7 +91,7 @@ def blocks(robot) -> dict[str, SolveBlock]:
     return {method: run(robot, method) for method in ik.METHODS}
 
 
-def test_every_method_is_here():
+def test_every_method_is_tested():
     assert tuple(METHODS) == ik.METHODS
 
 
@@ -105,7 +105,7 @@ def test_a_method_records_the_standard_fields(blocks, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_a_trace_says_is_true(robot, blocks, method):
+def test_trace_promises_hold(robot, blocks, method):
     check_trace(robot, blocks[method])
 
 
@@ -120,7 +120,7 @@ CASES = [
 @pytest.mark.parametrize(
     ("method", "field"), CASES, ids=[f"{method}-{field.name}" for method, field in CASES]
 )
-def test_a_field_that_is_zero_is_noticed(robot, blocks, method, field):
+def test_zeroed_field_is_detected(robot, blocks, method, field):
     rows = blocks[method].rows.copy()
     rows[field.name] = 0
     with pytest.raises(AssertionError):
@@ -128,7 +128,7 @@ def test_a_field_that_is_zero_is_noticed(robot, blocks, method, field):
 
 
 @pytest.mark.parametrize("field", STANDARD_FIELDS, ids=lambda field: field.name)
-def test_a_field_of_another_kind_is_refused(robot, blocks, field):
+def test_field_of_another_type_is_refused(robot, blocks, field):
     layout = blocks["thumb-first"].format.layout
     wrong_dtype = "u1" if field.dtype != "u1" else "f8"
     changed = Layout.record(

@@ -61,7 +61,7 @@ def answers(solver: ik.Solver, q0: np.ndarray, goal: np.ndarray) -> dict:
 
 @pytest.mark.parametrize("joint", [BASE, WRIST])
 @pytest.mark.parametrize("start", [6.2, -6.2, 9.5, -31.0])
-def test_the_answer_of_a_joint_without_limits_is_in_the_nearest_turn(solver, joint, start):
+def test_joint_without_limits_ends_in_the_nearest_turn(solver, joint, start):
     q0, goal = target_after_step(solver.robot, joint, start, np.copysign(0.25, start))
     for call, q in answers(solver, q0, goal).items():
         assert q[joint] == pytest.approx(goal[joint], abs=0.05), call
@@ -69,14 +69,14 @@ def test_the_answer_of_a_joint_without_limits_is_in_the_nearest_turn(solver, joi
 
 
 @pytest.mark.parametrize(("start", "step", "end"), [(6.0, 0.2, 6.2), (6.1, 0.4, 6.5 - TURN)])
-def test_the_answer_of_a_joint_with_limits_is_in_the_nearest_turn_within(solver, start, step, end):
+def test_joint_with_limits_ends_in_the_nearest_allowed_turn(solver, start, step, end):
     q0, goal = target_after_step(solver.robot, SHOULDER, start, step)
     for call, q in answers(solver, q0, goal).items():
         assert q[SHOULDER] == pytest.approx(end, abs=0.05), call
         assert solver.robot.beyond_limits(q) <= 1e-9, call
 
 
-def test_a_held_joint_stays_in_its_turn(solver):
+def test_fixed_joint_stays_in_its_turn(solver):
     q0, goal = target_after_step(solver.robot, BASE, 6.2, 0.25)
     name = solver.robot.actuators[BASE]
     q0[BASE] -= 20.0
@@ -85,7 +85,7 @@ def test_a_held_joint_stays_in_its_turn(solver):
     assert solution.q[BASE] == pytest.approx(goal[BASE], abs=1e-12)
 
 
-def test_a_path_of_two_turns_has_no_border(solver):
+def test_path_of_two_turns_is_continuous(solver):
     robot = solver.robot
     start, _ = target_after_step(robot, BASE, 5.0, 0.0)
     path = np.tile(start, (60, 1))
@@ -96,7 +96,7 @@ def test_a_path_of_two_turns_has_no_border(solver):
     np.testing.assert_allclose(track.q[:, BASE], path[:, BASE], atol=0.05)
 
 
-def test_a_follower_turns_without_end(solver):
+def test_follower_turns_endlessly(solver):
     robot = solver.robot
     start, _ = target_after_step(robot, BASE, 5.0, 0.0)
     path = np.tile(start, (2000, 1))
@@ -108,7 +108,7 @@ def test_a_follower_turns_without_end(solver):
     assert q[BASE] == pytest.approx(5.0 + 2 * TURN, abs=0.05)
 
 
-def test_a_motion_leads_to_the_nearest_turn(solver):
+def test_motion_leads_to_the_nearest_turn(solver):
     pytest.importorskip("toppra")
     q0, goal = target_after_step(solver.robot, BASE, 6.2, 0.25)
     motion = solver.reach(grasp_at(solver.robot, goal), q0=q0, distance=0.02).motion
@@ -116,5 +116,5 @@ def test_a_motion_leads_to_the_nearest_turn(solver):
     assert motion.q[-1, BASE] == pytest.approx(goal[BASE], abs=0.05)
 
 
-def test_a_joint_without_limits_is_written_as_such(robot):
+def test_joint_without_limits_is_written_as_continuous(robot):
     assert robot.description.continuous.sum() == robot.urdf().count('type="continuous"') == 2

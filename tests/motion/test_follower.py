@@ -26,7 +26,7 @@ def check_limits(robot, follower, q):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_moves_smoothly_is_followed_within_tolerance(robot, solver, seed):
+def test_smooth_motion_is_followed_within_tolerance(robot, solver, seed):
     path = smooth_path(robot, seed, 600, PERIOD, share=0.5)
     points, normals = robot.contacts(path)
     follower = solver.follow(path[0], PERIOD)
@@ -53,7 +53,7 @@ kinds = st.sampled_from(
 @example(seed=1, events=["near", "endless", "near"])
 @example(seed=182075427, events=["near", "near", "random", "random", "random", "NaN", "near"])
 @given(seed=st.integers(0, 2**32), events=st.lists(kinds, min_size=1, max_size=12))
-def test_limits_are_kept_whatever_the_targets_do(robot, solver, seed, events):
+def test_limits_are_kept_for_any_targets(robot, solver, seed, events):
     rng = np.random.default_rng(seed)
     start = robot.random(rng, 1)[0]
     follower = solver.follow(start, PERIOD)
@@ -86,7 +86,7 @@ def test_limits_are_kept_whatever_the_targets_do(robot, solver, seed, events):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_target_that_leaps_is_met_at_rest(robot, solver, seed):
+def test_jumping_target_is_reached_at_rest(robot, solver, seed):
     """Without going past it: every motor turns back never."""
     rng = np.random.default_rng(seed)
     start = 0.7 * robot.home + 0.3 * robot.random(rng, 1)[0]
@@ -104,7 +104,7 @@ def test_a_target_that_leaps_is_met_at_rest(robot, solver, seed):
     np.testing.assert_allclose(state.q, state.goal, atol=1e-4)
 
 
-def test_a_stream_goes_on_after_bad_frames(robot, solver):
+def test_stream_continues_after_bad_frames(robot, solver):
     path = smooth_path(robot, 9, 700, PERIOD, share=0.4)
     points, normals = robot.contacts(path)
     points[300:330] = np.nan
@@ -169,7 +169,7 @@ def test_fingertips_alone_and_a_wrist(robot, solver):
     assert offsets[0.1] < 0.5 * offsets[0.0]
 
 
-def test_another_branch_when_asked(robot, solver):
+def test_another_branch_on_request(robot, solver):
     grasp = ik.load_grasp("cup")
     first, *later_answers = (solution.q for solution in solver.solve_all(grasp, limit=4))
     follower = solver.follow(first, PERIOD)
@@ -202,7 +202,7 @@ def test_contacts_of_other_kinds(robot, solver):
     assert not np.isnan(follower.state.angle_error).any()
 
 
-def test_what_is_refused(robot, solver):
+def test_bad_follower_input_is_refused(robot, solver):
     follower = solver.follow(robot.home, PERIOD)
     points, normals = robot.contacts(robot.home)
     with pytest.raises(ik.errors.InputError, match=r"points:.*\(2, 3\).*\(3, 3\)"):

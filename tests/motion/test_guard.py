@@ -26,7 +26,7 @@ def clearances(solver, q):
     return around.check(q)
 
 
-def test_targets_in_a_table_are_not_followed_there(robot, solver):
+def test_targets_inside_a_table_are_not_followed(robot, solver):
     """It stops short of the table, says so, and goes on when the targets come out again."""
     points, normals = robot.contacts(robot.home)
     follower = solver.follow(robot.home, PERIOD)
@@ -54,7 +54,7 @@ def test_targets_in_a_table_are_not_followed_there(robot, solver):
     assert (np.abs(changes) <= follower.acceleration * PERIOD**2 * (1 + 1e-9)).all()
 
 
-def test_without_a_compiler_it_stops_at_the_same_places(robot, solver):
+def test_numpy_guard_stops_at_the_same_positions(robot, solver):
     points, normals = robot.contacts(robot.home)
     plain = ik.Solver(robot, scene=ik.load_scene("table"), compiled=False)
     paths, statuses = [], set()
@@ -69,7 +69,7 @@ def test_without_a_compiler_it_stops_at_the_same_places(robot, solver):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_leaping_targets_never_make_it_touch_anything(robot, solver, seed):
+def test_jumping_targets_cause_no_contact(robot, solver, seed):
     rng = np.random.default_rng(seed)
     follower = solver.follow(robot.home, PERIOD)
     q = [robot.home]
@@ -94,7 +94,7 @@ def led_through_each_other(body, shares):
 
 
 @pytest.mark.slow
-def test_hands_that_are_led_through_each_other_do_not_get_there():
+def test_hands_led_through_each_other_do_not_touch():
     """They stop before each other, and follow again on the way back."""
     body = ik.load_robot("g1+dex3")
     solver = ik.Solver(body, scene=ik.Scene())
@@ -114,7 +114,7 @@ def test_hands_that_are_led_through_each_other_do_not_get_there():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("period", [0.001, 0.01])
-def test_motors_come_to_rest_where_pairs_lack_clearance(period):
+def test_motors_stop_where_clearance_is_missing(period):
     """Nearly all pairs of links within a hand are nearer than the clearance that is kept."""
     body = ik.load_robot("g1+dex3")
     solver = ik.Solver(body, scene=ik.Scene())
@@ -128,7 +128,7 @@ def test_motors_come_to_rest_where_pairs_lack_clearance(period):
         np.testing.assert_array_equal(q[-second:], q[-1:].repeat(second, axis=0))
 
 
-def test_an_arm_in_the_way_holds_back_its_own_side():
+def test_blocked_arm_slows_its_own_side():
     """Hands leap to where a turned waist has them; the right shoulder would touch the torso."""
     body = ik.load_robot("g1+dex3")
     q = body.home.copy()
@@ -141,7 +141,7 @@ def test_an_arm_in_the_way_holds_back_its_own_side():
 
 
 @pytest.mark.slow
-def test_thumbs_that_pass_each_other_on_the_way_to_rest_are_apart_in_every_cycle():
+def test_passing_thumbs_keep_apart_in_every_cycle():
     """They are at the ends of that way, and at places on it, 25 cycles from one to the next."""
     body = ik.load_robot("g1+inspire")
     solver = ik.Solver(body, scene=ik.Scene())
@@ -179,7 +179,7 @@ def test_a_path_keeps_clear(robot, solver):
     assert clearances(solver, dense(track.q, motor_units(robot))).surplus.min() >= -RESOLUTION
 
 
-def test_what_stands_between_two_free_postures_is_seen(robot):
+def test_obstacle_between_free_postures_is_detected(robot):
     """A thin pole that the arm sweeps through, and a ball that is carried through the robot."""
     q_path = np.tile(robot.home, (3, 1))
     q_path[:, 0] += [-0.7, 0.7, 0.72]
@@ -205,7 +205,7 @@ def test_what_stands_between_two_free_postures_is_seen(robot):
     assert not check_path(moving, standing).free[0]
 
 
-def test_a_path_that_is_free_is_followed_as_without_a_scene(robot, solver):
+def test_free_path_is_followed_as_without_a_scene(robot, solver):
     path = smooth_path(robot, 2, 60, 0.02, share=0.5)
     path = robot.home + 0.05 * (path - path[0])
     assert clearances(solver, path).free.all()
@@ -215,7 +215,7 @@ def test_a_path_that_is_free_is_followed_as_without_a_scene(robot, solver):
     assert track.jumps == ()
 
 
-def test_free_motions_lead_around_a_collision_of_the_followed_postures():
+def test_free_motions_avoid_collisions_of_followed_postures():
     """The contacts are those of postures that mostly collide; the robot can hold them otherwise."""
     robot = ik.load_robot("g1+dex3")
     solver = ik.Solver(robot, scene=ik.Scene())

@@ -55,7 +55,7 @@ def check_motion(robot, grasp, reach_motion, q0):
 
 
 @pytest.mark.parametrize("scene", [None, ik.Scene()], ids=["no scene", "nothing in it"])
-def test_straight_there_then_straight_on_then_closing(robot, grasp, scene):
+def test_approach_is_straight_and_then_closes(robot, grasp, scene):
     grasp, solver = ik.Grasp(grasp.contacts), ik.Solver(robot, scene=scene)
     reach_motion = solver.reach(grasp, distance=0.1, opening=0.025)
     part = check_motion(robot, grasp, reach_motion, robot.home)
@@ -77,7 +77,7 @@ def test_straight_there_then_straight_on_then_closing(robot, grasp, scene):
     ("name", "period"),
     [("tennis_ball", 0.01), ("apple", 0.004), ("tomato_soup_can", 0.02), ("cup", 0.05)],
 )
-def test_what_is_sent_keeps_to_the_limits(robot, name, period):
+def test_motion_keeps_velocity_and_acceleration_limits(robot, name, period):
     """Closing passes corners, where joints come to limits; the figures are measured."""
     motion = ik.Solver(robot).reach(ik.load_grasp(name), period=period)
     velocity, acceleration = sent(motion.motion)
@@ -102,7 +102,7 @@ def test_short_and_kinked_paths_are_timed(robot):
             assert ((q >= path.min(axis=0)) & (q <= path.max(axis=0))).all()
 
 
-def test_a_clearance_is_that_between_samples_too(robot):
+def test_clearance_holds_between_samples(robot):
     """A ball beside the way, passed between two samples that are far apart."""
     grasp = ik.Grasp(ik.load_grasp("cup").contacts)
     path = ik.Solver(robot).reach(grasp).motion
@@ -125,7 +125,7 @@ def test_a_clearance_is_that_between_samples_too(robot):
     assert last.clearance == pytest.approx(min_distance, abs=1e-4)
 
 
-def test_around_what_is_in_the_way(robot):
+def test_path_leads_around_an_obstacle(robot):
     """A ball where the straight way leads: OMPL goes around it."""
     start = robot.home + 1.6 * (np.arange(14) == 0)
     ends = np.stack([start, robot.home])
@@ -143,7 +143,7 @@ def test_around_what_is_in_the_way(robot):
     assert (no_corners, reason_inside) == (None, "the start is not free: bh_base and ball touch")
 
 
-def test_all_of_it_is_free(robot, grasp):
+def test_whole_motion_is_collision_free(robot, grasp):
     solver = ik.Solver(robot, scene=ik.load_scene("table"))
     motion = solver.reach(grasp)
     part = check_motion(robot, grasp, motion, robot.home)
@@ -154,7 +154,7 @@ def test_all_of_it_is_free(robot, grasp):
     assert motion.clearance >= 0
 
 
-def test_what_cannot_be_reached_is_said(robot, grasp):
+def test_unreachable_grasp_is_explained(robot, grasp):
     far_pose = np.eye(4)
     far_pose[0, 3] = 5.0
     motion = ik.Solver(robot).reach(grasp.at(far_pose))
@@ -170,7 +170,7 @@ def test_what_cannot_be_reached_is_said(robot, grasp):
         ik.Solver(robot).reach(grasp, distance=-1)
 
 
-def test_where_the_way_is_barred_the_hand_comes_another(robot, grasp):
+def test_blocked_approach_uses_another_direction(robot, grasp):
     """A lid over the object; from the side it can be reached."""
     points, _ = grasp.arrays(robot.fingers)
     place = (points.mean(axis=0) + np.array([0.0, 0.0, 0.25])).tolist()
@@ -184,7 +184,7 @@ def test_where_the_way_is_barred_the_hand_comes_another(robot, grasp):
     assert np.linalg.norm(coming[-1] - coming[0]) == pytest.approx(0.3, abs=5e-3)
 
 
-def test_it_is_written_as_a_follower_is(robot, grasp, tmp_path):
+def test_motion_is_written_like_a_followed_one(robot, grasp, tmp_path):
     motion = ik.Solver(robot).reach(grasp).motion
     for suffix in ("npz", "csv", "mcap"):
         motion.write(tmp_path / f"way.{suffix}")
@@ -199,7 +199,7 @@ def test_it_is_written_as_a_follower_is(robot, grasp, tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_the_last_part_alone(robot, grasp):
+def test_approach_alone(robot, grasp):
     """A pre-grasp with open fingers, straight on; in a scene all of it is free, or it is said."""
     motion = ik.Solver(robot).approach(grasp, distance=0.06, opening=0.015)
     assert (motion.success, motion.reason, motion.clearance) == (True, "", None)
@@ -217,7 +217,7 @@ def test_the_last_part_alone(robot, grasp):
     assert blocked.reason
 
 
-def test_a_palm_that_is_given_is_reached(robot, grasp):
+def test_given_palm_is_reached(robot, grasp):
     """Fingers open and close about the posture that is held."""
     solution = ik.Solver(robot).solve(grasp)
     motors = robot.actuators[7:]
@@ -237,7 +237,7 @@ def on_table(robot, grasp):
     return solver, solver.choose([grasp], limit=3, prefer="limits", per_candidate=None)
 
 
-def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
+def test_chosen_posture_is_reached(robot, grasp, on_table):
     solver, ranked = on_table
     for choice in ranked:
         motion = solver.reach(choice)
@@ -256,7 +256,7 @@ def test_the_very_posture_that_was_chosen(robot, grasp, on_table):
         solver.reach(3)
 
 
-def test_candidates_of_choose_are_where_the_object_is(robot, grasp):
+def test_candidates_follow_the_object(robot, grasp):
     """The grasps come in the object's frame, the answers in the base frame."""
     pose = grasp.object_pose
     (choice,) = ik.Solver(robot).choose([grasp.in_object_frame()], object_pose=pose, limit=1)
@@ -265,7 +265,7 @@ def test_candidates_of_choose_are_where_the_object_is(robot, grasp):
     np.testing.assert_allclose(choice.grasp.object_pose, pose, atol=1e-12)
 
 
-def test_a_direction_that_is_given_or_known(robot, grasp):
+def test_given_or_known_approach_direction(robot, grasp):
     solver, down = ik.Solver(robot), np.array([0.0, 0.0, -1.0])
     (choice,) = solver.choose([grasp], limit=1)
 
@@ -288,7 +288,7 @@ def test_a_direction_that_is_given_or_known(robot, grasp):
         solver.reach(grasp, direction=[0, 0, 0])
 
 
-def test_the_object_goes_along(robot, grasp, on_table):
+def test_object_moves_with_the_hand(robot, grasp, on_table):
     solver, ranked = on_table
     reach_motion = solver.reach(ranked[0], lift=0.1, retreat=0.08)
     motion, part = reach_motion.motion, reach_motion.motion.notes["part"]
@@ -314,7 +314,7 @@ def test_the_object_goes_along(robot, grasp, on_table):
         hand.reach(ik.load_grasp("ar10_cup"), lift=0.1)
 
 
-def test_what_stands_on_something_may_be_lifted_from_it(robot, grasp, on_table):
+def test_supported_object_can_be_lifted(robot, grasp, on_table):
     """The object touches what it stands on."""
     _, ranked = on_table
     below = (grasp.object_pose[:3, 3] - np.array([0.0, 0.0, 0.03 + 0.005])).tolist()
@@ -323,7 +323,7 @@ def test_what_stands_on_something_may_be_lifted_from_it(robot, grasp, on_table):
     assert solver.reach(ranked[0], lift=0.05).success
 
 
-def test_from_posture_to_posture(robot, grasp, on_table):
+def test_move_between_postures(robot, grasp, on_table):
     solver, ranked = on_table
     motion = solver.move(robot.home, ranked[0].q)
     assert (motion.status, motion.reason) == (ik.motion.ReachStatus.REACHED, "straight")

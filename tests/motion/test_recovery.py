@@ -40,7 +40,7 @@ def clearances(solver, q):
         ),
     ],
 )
-def test_a_target_that_comes_back_is_followed_again(name, has_scene, kind):
+def test_returning_target_is_followed_again(name, has_scene, kind):
     robot = ik.load_robot(name)
     solver = ik.Solver(robot, scene=ik.Scene() if has_scene else None)
     for start in free_starts(robot, 10):

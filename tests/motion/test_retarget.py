@@ -41,7 +41,7 @@ def retarget(tmp_path):
     return read
 
 
-def test_ten_lines(tmp_path):
+def test_ten_line_program(tmp_path):
     path = tmp_path / "hand.yaml"
     path.write_text(TEN_LINES)
     config = ik.motion.load_retarget(path)
@@ -69,7 +69,7 @@ def test_a_bad_file_is_refused_by_key(tmp_path, old, new, message):
     assert str(caught.value).startswith(str(path))
 
 
-def test_a_finger_that_the_robot_has_not(robot, retarget):
+def test_missing_finger_is_refused(robot, retarget):
     with pytest.raises(ik.errors.InputError, match=r"fingers\.little: "):
         ik.motion.Retargeter(retarget(fingers={"little": 20}), robot)
 
@@ -95,7 +95,7 @@ def test_motions_are_scaled_and_turned(robot, retarget):
     assert np.arccos((np.trace(relative) - 1) / 2) == pytest.approx(0.3)
 
 
-def test_without_a_frame_the_first_one_tells_it(robot, retarget):
+def test_first_frame_defines_the_frame(robot, retarget):
     """Fingertips of a person who holds the hand as the robot does are the robot's own."""
     points, _ = robot.contacts(robot.home)
     palm = robot.palm(robot.home)
@@ -116,7 +116,7 @@ def spans(frame, target, robot, config):
 
 
 @pytest.mark.parametrize("name", ["panda+allegro_right", "kuka_lwr_barrett", "ur5e+robotiq_3f"])
-def test_sizes_are_those_of_open_hands(name, retarget):
+def test_hand_size_is_measured_when_open(name, retarget):
     """Neither the robot's posture nor the person's first one counts: a pinch is a pinch."""
     robot = ik.load_robot(name)
     config, place = retarget(robot), np.array([0.3, 0.1, 0.6])
@@ -146,7 +146,7 @@ def seen_by_mediapipe(bend, wrist):
     return frame - frame.mean(axis=0) + [0.004, -0.006, 0.002]
 
 
-def test_of_world_landmarks_the_wrist_stays(robot, retarget):
+def test_wrist_of_world_landmarks_stays(robot, retarget):
     config = retarget(robot)
     home = robot.palm(robot.home)[:3, 3]
     bends = [(bend, np.array([0.2 * bend, 0.1, 0.5])) for bend in (0.1, 0.5, 0.9)]
@@ -173,7 +173,7 @@ def test_of_world_landmarks_the_wrist_stays(robot, retarget):
 
 
 @pytest.mark.parametrize("size", [0.35, 0.1])
-def test_image_landmarks_are_refused_in_words(robot, size, retarget):
+def test_image_landmarks_are_refused(robot, size, retarget):
     """Parts of the picture's width and height, depths from the wrist; fingers may be beyond it."""
     frame = hand(0.3, np.zeros(3)) * size / 0.09 + [0.4, 0.5, 3e-7]
     with pytest.raises(ik.errors.InputError, match=r"landmarks"):
@@ -209,7 +209,7 @@ def test_a_left_hand_moves_a_right_robot_hand(robot, retarget):
         assert np.linalg.det(flat) == pytest.approx(-np.linalg.det(tips))
 
 
-def test_smoothing_does_not_depend_on_how_often_it_is_called(robot, retarget):
+def test_smoothing_is_independent_of_the_call_rate(robot, retarget):
     """A frame at 30 Hz, looked at once or in every cycle of a follower at a kilohertz or two."""
     config = replace(retarget(robot), scaling=1.0, low_pass=0.3)
     frames = [hand(0.4, np.array([0.05 * i, 0.0, 0.4])) for i in range(5)]
@@ -234,7 +234,7 @@ def test_low_pass(robot, retarget):
     np.testing.assert_allclose([m[0] for m in shifts], 0.1 * (1 - 0.75 ** np.arange(1, 4)))
 
 
-def test_a_frame_with_nan_asks_for_nothing_and_is_forgotten(robot, retarget):
+def test_nan_frame_is_ignored(robot, retarget):
     retargeter = ik.motion.Retargeter(retarget(robot), robot)
     target_before = retargeter(hand(0.4, np.zeros(3)))
     bad = hand(0.4, np.zeros(3))
@@ -345,7 +345,7 @@ def test_both_hands_drive_a_body_in_mujoco(g1, both_hands):
 
 
 @pytest.mark.parametrize("sees_both_first", [True, False])
-def test_a_hand_that_is_not_seen_comes_to_rest(g1, both_hands, sees_both_first):
+def test_unseen_hand_comes_to_rest(g1, both_hands, sees_both_first):
     config = ik.motion.load_retarget(KEYPOINTS / "two_hands_g1.yaml")
     retargeter = ik.motion.Retargeter(config, g1, g1.home)
     first = {side: frames[0] for side, frames in both_hands.items()}
@@ -378,7 +378,7 @@ def test_joints_of_openxr_are_keypoints(robot, retarget):
         ("fingers: {thumb: 4}", "sides: .*left, right"),
     ],
 )
-def test_sides_that_a_body_has_not_are_refused(g1, tmp_path, text, message):
+def test_missing_sides_are_refused(g1, tmp_path, text, message):
     (tmp_path / "hands.yaml").write_text(text)
     config = ik.motion.load_retarget(tmp_path / "hands.yaml")
     with pytest.raises(ik.errors.InputError, match=message):
@@ -401,7 +401,7 @@ def test_a_bad_file_of_sides_is_refused(tmp_path, text, message):
         ik.motion.load_retarget(tmp_path / "hands.yaml")
 
 
-def test_two_hands_are_given_by_side(g1, both_hands):
+def test_two_hands_are_passed_by_side(g1, both_hands):
     config = ik.motion.load_retarget(KEYPOINTS / "two_hands_g1.yaml")
     retargeter = ik.motion.Retargeter(config, g1)
     with pytest.raises(ik.errors.InputError, match="left, right"):
@@ -412,7 +412,7 @@ def test_two_hands_are_given_by_side(g1, both_hands):
         retargeter({"left": np.zeros((20, 3))})
 
 
-def test_palms_of_a_body_are_asked_by_side(g1):
+def test_palms_of_a_body_are_returned_by_side(g1):
     follower = ik.Solver(g1).follow(g1.home, period=0.01)
     points, _ = g1.contacts(g1.home)
     with pytest.raises(ik.errors.InputError, match=r"palm: .*left, right"):

@@ -43,7 +43,7 @@ def test_it_begins_where_the_robot_is(robot, solver):
     np.testing.assert_allclose(track.q[0], path[0], atol=0.05)
 
 
-def test_a_jump_that_cannot_be_avoided_is_reported(robot, solver):
+def test_unavoidable_jump_is_reported(robot, solver):
     """Joint 7 turns twice, which no arm can follow; every grasp on the way can be reached."""
     turns = np.linspace(-2 * np.pi, 2 * np.pi, 160)
     path = np.tile(robot.home, (len(turns), 1))
@@ -64,7 +64,7 @@ def test_a_jump_that_cannot_be_avoided_is_reported(robot, solver):
     assert np.delete(steps, jumped).max() < steps[jumped].min()
 
 
-def test_motors_keep_their_velocities_and_catch_up(robot, solver):
+def test_motors_keep_velocities_and_catch_up(robot, solver):
     """A grasp too fast for the motors is met late, and met again once it stands still."""
     path = smooth_path(robot, 1, count=10)
     path = np.concatenate([path, np.tile(path[-1], (200, 1))])
@@ -87,7 +87,7 @@ def test_the_robots_own_velocities(robot, solver):
     assert (np.abs(np.diff(track.q, axis=0)) <= velocities * period * (1 + 1e-9)).all()
 
 
-def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
+def test_unreachable_grasp_is_approached(robot, solver):
     """On the way out of the workspace and back: the contacts are missed there and met again."""
     points, normals = robot.contacts(robot.home)
     excursion = 0.8 * np.sin(np.linspace(0, np.pi, 40))
@@ -100,7 +100,7 @@ def test_a_grasp_out_of_reach_is_come_near_to(robot, solver):
     np.testing.assert_array_equal(track.success, reachable)
 
 
-def test_what_is_refused(robot, solver):
+def test_bad_tracking_input_is_refused(robot, solver):
     moving = [grasp_at(robot, robot.home)] * 2
     with pytest.raises(ik.errors.InputError, match=r"grasps: .*0"):
         solver.track([])

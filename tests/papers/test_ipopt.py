@@ -36,7 +36,7 @@ def cost(batch: ik.BatchSolution) -> np.ndarray:
     return np.nansum((batch.position_error / 0.1) ** 2 + chords**2, axis=1)
 
 
-def test_a_start_close_to_the_solution_stays_close(robot, rng):
+def test_start_near_the_solution_stays_near(robot, rng):
     """A small barrier and a slight pull: no detour along the arm's self-motion."""
     q = np.array([middle(robot, rng) for _ in range(10)])
     starts = q + 1e-3 * rng.normal(size=q.shape)
@@ -72,7 +72,7 @@ def test_joint_limits_are_kept(tmp_path, rng):
 
 
 @pytest.mark.filterwarnings("ignore:overflow")
-def test_numbers_that_are_not_finite_are_a_status(robot):
+def test_non_finite_numbers_have_a_status(robot):
     points, normals = robot.contacts(robot.home[None])
     batch = ik.Solver(robot, "ipopt", options={"restarts": 0}).solve_batch(1e200 * points, normals)
     assert not batch.success.any()
@@ -102,7 +102,7 @@ def test_shipped_grasps(name, solver):
     assert solution.success, solution.status
 
 
-def test_impossible_contacts_are_met_no_worse_than_by_hand_first(robot, targets):
+def test_impossible_contacts_are_met_as_well_as_by_hand_first(robot, targets):
     """Half a metre out of reach, fingers torn apart, a normal turned round."""
     points, normals = (array[:3].copy() for array in targets)
     points[0] += [0.0, 0.0, 1.5]
@@ -135,7 +135,7 @@ def test_free_fingers_and_normals(robot, solver, targets):
     assert not solver.solve_batch(points[2:3], turned_normals[2:3]).success[0]
 
 
-def test_limits_are_never_left(robot, tmp_path, targets):
+def test_limits_are_never_exceeded(robot, tmp_path, targets):
     """Neither by the answer nor by any iterate; ignored, they are no bounds."""
     path = tmp_path / "log.mcap"
     batch = ik.Solver(robot, "ipopt").solve_batch(*targets, log=path)

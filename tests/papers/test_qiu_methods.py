@@ -57,7 +57,7 @@ def call(f, q, points, normals) -> np.ndarray:
     return np.array(f(q, points, normals)).ravel()
 
 
-def test_own_contacts_are_found_again(robot, closed, rng):
+def test_generating_contacts_are_recovered(robot, closed, rng):
     """For what a hand can do exactly, the step finds how, whatever the posture before."""
     hand = [SPREAD, *FLEXIONS["finger_2"], *FLEXIONS["finger_3"]]
     fixed_joints = [i for i in range(14) if i not in hand]
@@ -80,7 +80,7 @@ def test_closed_form_equals_ipopt(robot, closed, ipopt, rng):
         )
 
 
-def test_far_side_of_the_circle_is_a_trap_that_ipopt_avoids(own_robot, rng):
+def test_far_side_of_the_circle_is_avoided_by_ipopt(own_robot, rng):
     """With wide limits both minima lie inside; the nearer one has to win."""
     hand = own_robot.with_name("hand.yaml")
     text = hand.read_text().replace("[0 deg, 140 deg]", "[-170 deg, 170 deg]")
@@ -134,7 +134,7 @@ def test_normals_decide_spread_and_flexion_sum(robot, closed, rng):
         np.testing.assert_allclose(seen_from_palm(robot, after)[1], normals, atol=1e-9)
 
 
-def test_attainable_normal_nearest_to_the_demand(robot, closed):
+def test_nearest_attainable_normal(robot, closed):
     """A demand beyond the flexion limits is moved to the nearest end."""
     q = robot.home
     for excess in (-0.1, -0.3, -0.6):
@@ -258,7 +258,7 @@ def test_most_pinches_are_solved(robot):
 
 
 @pytest.mark.slow
-def test_choices_that_matter_and_that_do_not(robot):
+def test_influential_and_neutral_choices(robot):
     """One change each, with its effect."""
     points, normals = pinch_targets(robot, 4)
 
@@ -381,7 +381,7 @@ def test_a_start_beyond_enforced_limits_is_moved_to_them(robot):
         np.testing.assert_array_equal(trace["q"][0], first)
 
 
-def test_phases_in_their_order_end_at_the_first_configuration_that_solves(pinches):
+def test_phases_end_at_the_first_solution(pinches):
     *_, batch, traces = pinches
     for solved, trace in zip(batch.success, traces, strict=True):
         assert set(trace["phase"]) <= {REACHING, ALIGNMENT}
@@ -392,6 +392,6 @@ def test_phases_in_their_order_end_at_the_first_configuration_that_solves(pinche
             assert (off | (rows_before["angle_error"].max(axis=1) > np.radians(3))).all()
 
 
-def test_robots_the_paper_has_no_answer_for(coupled_robot):
+def test_unsupported_robots_are_refused(coupled_robot):
     with pytest.raises(ik.errors.UnsupportedError, match=coupled_robot.name):
         ik.Solver(coupled_robot, "enhanced-dls")

@@ -57,7 +57,7 @@ def test_eqs_1_and_2_literally(robot, rng):
     np.testing.assert_allclose(estimate(robot, points), np.stack(axes, axis=1), atol=1e-12)
 
 
-def test_another_palm_frame_turns_the_estimate_with_it(own_robot, robot, rng):
+def test_estimate_rotates_with_the_palm_frame(own_robot, robot, rng):
     replace(
         own_robot.with_name("hand.yaml"),
         "palm: {link: bh_base,",

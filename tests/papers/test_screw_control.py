@@ -83,7 +83,7 @@ def test_two_sliders_cannot_take_six_rows_to_zero(toy):
     assert (run.q <= toy.upper).all()
 
 
-def test_null_space_returns_to_mid_range_and_the_task_never_notices(toy, rng):
+def test_null_space_returns_to_mid_range_without_disturbing_the_task(toy, rng):
     control, still = law(toy, centring=0.2), law(toy)
     start = posture(toy, rng, 0.9)
     target = control.target(start)
@@ -99,7 +99,7 @@ def test_null_space_returns_to_mid_range_and_the_task_never_notices(toy, rng):
     assert spread(centred.q[-1]) < 0.9 * spread(start)
 
 
-def test_a_slider_at_its_limit_leaves_the_rest_to_the_others(toy):
+def test_slider_at_its_limit_leaves_the_motion_to_the_others(toy):
     """From a corner, towards a target that three motors reach without the one in the corner."""
     corner = middle(toy)
     corner[1] = toy.upper[1]
@@ -171,12 +171,12 @@ def test_a_log_of_a_run(toy, rng, tmp_path):
         ),
     ],
 )
-def test_bad_input_is_one_clear_error(make, error, words, toy):
+def test_bad_input_is_refused(make, error, words, toy):
     with pytest.raises(error, match=words):
         make(toy)
 
 
-def test_an_arm_helps_where_a_finger_alone_cannot_reach(rng):
+def test_arm_extends_the_reach_of_a_finger(rng):
     """On Baxter the index tip goes 10 cm away; arm and sliders share the work, within limits."""
     baxter = ik.load_robot("baxter_ar10")
     control = ik.papers.ScrewControl(

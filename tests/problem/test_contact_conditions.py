@@ -91,7 +91,7 @@ def every_kind(test):
 
 
 @every_kind
-def test_jacobian_of_the_whole_is_the_slope_of_the_residual(robot, kind, rng):
+def test_full_jacobian_matches_differences(robot, kind, rng):
     q, q_target = robot.random(rng, 2)
     p, rows = parameters(data_at(robot, q_target, rng)), ContactRows((kind,) * 3)
 
@@ -105,7 +105,7 @@ def test_jacobian_of_the_whole_is_the_slope_of_the_residual(robot, kind, rng):
 
 
 @every_kind
-def test_jacobian_of_the_hand_is_the_slope_of_the_residual(robot, kind, rng):
+def test_hand_jacobian_matches_differences(robot, kind, rng):
     """Over a palm that shifts and turns, too: there it is the targets that move."""
     q, q_target = robot.random(rng, 2)
     p, rows = parameters(data_at(robot, q_target, rng)), ContactRows((kind,) * 3)
@@ -127,7 +127,7 @@ def test_jacobian_of_the_hand_is_the_slope_of_the_residual(robot, kind, rng):
 
 
 @every_kind
-def test_hand_and_whole_have_the_same_residual(robot, kind, rng):
+def test_hand_and_full_residuals_agree(robot, kind, rng):
     """Lengths are the same in every frame."""
     q, q_target = robot.random(rng, 2)
     p, rows = parameters(data_at(robot, q_target, rng)), ContactRows((kind,) * 3)
@@ -141,7 +141,7 @@ def test_hand_and_whole_have_the_same_residual(robot, kind, rng):
 
 
 @every_kind
-def test_rows_of_newton_are_the_slopes_of_the_error_at_the_target(robot, kind, rng):
+def test_newton_rows_match_differences_at_the_target(robot, kind, rng):
     (q,) = robot.random(rng, 1)
     p, rows = parameters(data_at(robot, q, rng), np.ones((3, 2))), ContactRows((kind,) * 3)
 
@@ -201,7 +201,7 @@ angles = st.floats(-3.1, 3.1)
 
 
 @given(turn=st.tuples(angles, angles, angles), rotation_axis=st.sampled_from([0, 1, 2]))
-def test_a_frame_weighs_every_turn_alike(turn, rotation_axis):
+def test_frame_error_is_isotropic(turn, rotation_axis):
     """The length of its residual is the chord of the angle, about whatever axis it is turned."""
     start = Rotation.from_euler("xyz", turn)
     axis, angle = np.eye(3)[rotation_axis], abs(turn[0])
@@ -216,7 +216,7 @@ def test_a_frame_weighs_every_turn_alike(turn, rotation_axis):
     np.testing.assert_allclose(vector, axis * angle, atol=1e-7)
 
 
-def test_a_frame_without_a_tangent_is_a_normal(robot, rng):
+def test_frame_without_tangent_is_a_normal(robot, rng):
     """A tangent of zero is free, so one kernel serves fingers with and without one."""
     q, q_target = robot.random(rng, 2)
     data = data_at(robot, q_target, rng)
@@ -239,7 +239,7 @@ def test_a_frame_without_a_tangent_is_a_normal(robot, rng):
     np.testing.assert_allclose(gram[0].T @ gram[0], gram[1].T @ gram[1], atol=1e-9)
 
 
-def test_best_palm_takes_tangents_into_account(robot, rng):
+def test_best_palm_uses_tangents(robot, rng):
     """One finger with its whole frame fixes the palm of a posture; point and normal do not."""
     (q,) = robot.random(rng, 1)
     weights = np.array([[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
@@ -251,7 +251,7 @@ def test_best_palm_takes_tangents_into_account(robot, rng):
     np.testing.assert_allclose(number(origin).ravel(), robot.palm(q)[:3, 3], atol=1e-3)
 
 
-def test_the_kind_follows_from_the_data():
+def test_contact_kind_follows_from_the_data():
     assert (
         kind_from_vectors(["point"])
         == kind_from_vectors(["point", "normal"])
@@ -270,7 +270,7 @@ def test_graphs_of_different_kinds_have_different_names():
     assert kinds_suffix(point_normal_kinds(3)) == ""
 
 
-def test_contact_frames_hold_the_contacts(robot, coupled_robot, rng):
+def test_contact_frames_contain_the_contacts(robot, coupled_robot, rng):
     for model in (robot, coupled_robot):
         q = model.random(rng, 20)
         frames, (points, normals) = model.contact_frames(q), model.contacts(q)
@@ -337,7 +337,7 @@ def test_residual_vanishes_at_the_generating_configuration(robot, layouts, postu
     assert np.abs(number(contact_residual(robot.description, ROWS, ca.SX(q), p))).max() < 1e-13
 
 
-def test_best_palm_finds_the_palm_of_the_right_posture(robot, layouts, rng):
+def test_best_palm_recovers_the_palm(robot, layouts, rng):
     for q in robot.random(rng, 10):
         contacts = hand_contacts(robot.description, ca.SX(q[ARM:]), layouts.robot.hand_actuators)
         rotation, origin = best_palm(contacts, ROWS, fit_parameters(robot, *robot.contacts(q)))
@@ -347,7 +347,7 @@ def test_best_palm_finds_the_palm_of_the_right_posture(robot, layouts, rng):
 
 
 @pytest.mark.parametrize(("shift", "sign"), [(0.0, 0), (1.0, 1), (-2.0, -1)])
-def test_reach_row(robot, shift, sign):
+def test_reach_row_matches_differences(robot, shift, sign):
     """Zero within reach, the distance beyond it, and its slope."""
     arm, p = srs_arm(robot.description), fit_parameters(robot, np.ones((3, 3)), np.ones((3, 3)))
     rotation = robot.palm(robot.home)[:3, :3]
@@ -368,7 +368,7 @@ def test_reach_row(robot, shift, sign):
     assert np.any(slope) == (sign != 0)
 
 
-def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
+def test_numeric_arm_starts_are_sorted_by_distance(robot):
     start = nearest_start(robot.description)
     palm = robot.palm(robot.home)
     previous, distances, arms = -1.0, [], []
@@ -389,7 +389,7 @@ def test_starts_of_the_numeric_arm_come_in_the_order_of_their_distance(robot):
     assert distances[0] == pytest.approx(off, abs=1e-9)
 
 
-def test_a_solve_tries_all_starts_of_the_numeric_arm():
+def test_solve_tries_all_numeric_arm_starts():
     options = HandFirstParameters()
     assert (
         options.rounds * options.candidates * NUMERIC_ARM_PARAMETERS.starts
@@ -397,7 +397,7 @@ def test_a_solve_tries_all_starts_of_the_numeric_arm():
     )
 
 
-def test_a_step_of_the_numeric_arm_lowers_what_it_promises(robot, rng):
+def test_numeric_arm_step_decreases_the_predicted_cost(robot, rng):
     q, q_target = robot.random(rng, 2)
     palm = robot.palm(np.clip(q + 0.01, robot.lower, robot.upper))
     p = fit_parameters(robot, *robot.contacts(q_target))

@@ -18,7 +18,7 @@ def solver(robot):
     return ik.Solver(robot, compiled=False)
 
 
-def test_the_length_of_a_normal_does_not_count(robot, solver):
+def test_normal_length_is_ignored(robot, solver):
     points, normals = (x[None] for x in robot.contacts(robot.home))
     usual, longer = (solver.solve_batch(points, scale * normals) for scale in (1, 7))
     assert longer.success.all()
@@ -26,7 +26,7 @@ def test_the_length_of_a_normal_does_not_count(robot, solver):
     np.testing.assert_allclose(longer.angle_error, usual.angle_error, atol=1e-9)
 
 
-def test_what_is_free_has_no_error(robot, solver):
+def test_free_components_have_no_error(robot, solver):
     points, normals = (x[None].repeat(2, axis=0) for x in robot.contacts(robot.home))
     points[0, 1] = normals[0, 1] = normals[1, 2] = np.nan
     batch = solver.solve_batch(points, normals)

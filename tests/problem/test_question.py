@@ -25,7 +25,7 @@ def grasp(robot, q, tolerances=None, shift=0.0) -> ik.Grasp:
 
 
 @pytest.mark.parametrize("method", ["hand-first", "ipopt", "enhanced-dls"])
-def test_every_contact_is_judged_by_its_own_tolerance(robot, method):
+def test_each_contact_has_its_tolerance(robot, method):
     """Fingers that must be exact are, at the cost of the thumb that need not be."""
     options = {"finger_step": "closed-form"} if method.startswith("enhanced") else {}
     solver = ik.Solver(robot, method, tolerance=ik.Tolerance(1e-3, 1e-2), **options)
@@ -39,7 +39,7 @@ def test_every_contact_is_judged_by_its_own_tolerance(robot, method):
         assert contact.angle_error <= expected.angle
 
 
-def test_a_coarse_contact_makes_a_grasp_possible(robot):
+def test_coarse_contact_makes_a_grasp_possible(robot):
     """Moved by 70 mm the thumb cannot be met exactly; with a tolerance of its own it need not."""
     q = robot.home + 0.01
     assert not ik.Solver(robot).solve(grasp(robot, q, shift=0.07), diagnose=False).success
@@ -80,7 +80,7 @@ def test_grasp_file_with_tolerances(tmp_path):
 
 
 @pytest.mark.parametrize("method", ["hand-first", "ipopt"])
-def test_fixed_actuators_stay_where_they_are(robot, method):
+def test_fixed_actuators_stay(robot, method):
     """The elbow's swivel is the arm's one freedom: joint 3 can be given, within reason."""
     solver = ik.Solver(robot, method)
     points, normals = robot.contacts(robot.random(np.random.default_rng(3), 20))
@@ -95,7 +95,7 @@ def test_fixed_actuators_stay_where_they_are(robot, method):
         assert batch.q[0, 2] == value
 
 
-def test_a_spread_that_does_not_fit_is_found_out(robot):
+def test_unsuitable_spread_is_detected(robot):
     """With the hand's spread held elsewhere the contacts cannot be met, and the verdict says so."""
     solution = ik.Solver(robot).solve(grasp(robot, robot.home), fixed={"bh_spread": 2.5})
     assert not solution.success
@@ -105,7 +105,7 @@ def test_a_spread_that_does_not_fit_is_found_out(robot):
     assert solution.diagnosis.q[robot.actuators.index("bh_spread")] == 2.5
 
 
-def test_what_is_refused(robot):
+def test_bad_queries_are_refused(robot):
     solver = ik.Solver(robot)
     grasp_at_home = grasp(robot, robot.home)
     with pytest.raises(ik.errors.UnknownNameError, match=r"fixed:.*'elbow'.*lwr_"):

@@ -20,7 +20,7 @@ ON_DEMAND = "pinocchio coal matplotlib pyvista polars mujoco scipy proxsuite tri
 """What the public names do not import."""
 
 
-def test_version_is_said_once():
+def test_version_is_stated_once():
     assert PROJECT["dynamic"] == ["version"]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert citation["version"] == ik.__version__
@@ -71,7 +71,7 @@ def test_the_core_solves_and_logs_without_extras(tmp_path):
 @pytest.mark.parametrize(
     "program", ["import casadi_ik", "import casadi_ik as ik; ik.Solver; ik.load_robot('ar10')"]
 )
-def test_what_is_imported(program):
+def test_imported_modules(program):
     script_end = f"; import sys; print(*(x for x in {ON_DEMAND!r}.split() if x in sys.modules))"
     done = python("-c", program + script_end)
     assert (done.stdout.strip(), done.stderr, done.returncode) == ("", "", 0)

@@ -48,7 +48,7 @@ def test_published_reference_pose(ar10):
     np.testing.assert_allclose(pose[:3, 3], tip, atol=1e-6)
 
 
-def test_pads_face_where_the_fingers_flex(ar10):
+def test_pads_face_the_flexion_direction(ar10):
     """A pad's normal is the direction in which flexing its last joint moves the tip."""
     for finger in ar10.description.fingers:
         rows = list(ar10.description.finger_actuators(finger.name))

@@ -16,7 +16,7 @@ def anywhere(robot, seed=1):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_side_by_itself_stands_as_it_does_in_the_body(name):
+def test_side_alone_matches_the_body(name):
     robot = ik.load_robot(name)
     body, q = robot.description, anywhere(robot)
     trunk = list(body.trunk_actuators)
@@ -42,7 +42,7 @@ def test_a_side_by_itself_stands_as_it_does_in_the_body(name):
 
 
 @pytest.mark.parametrize("name", ["g1+dex3", "g1+inspire", "h1_2+inspire"])
-def test_a_body_with_mirrored_sides_reflects(name):
+def test_mirrored_sides_reflect(name):
     """The same grasp by the other side is the mirror image of this one's."""
     robot = ik.load_robot(name)
     body, q = robot.description, robot.home.copy()
@@ -131,7 +131,7 @@ def in_a_file(tmp_path: Path) -> Path:
     return path
 
 
-def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
+def test_trunk_and_sides_are_read_from_a_file(in_a_file: Path):
     body = ik.load_robot(in_a_file).description
     assert (body.trunk, body.trunk_link) == (("waist",), "torso")
     left, right = body.sides
@@ -173,12 +173,12 @@ def test_trunk_and_sides_are_found_in_a_file(in_a_file: Path):
         ("sides:", "colour: red\nsides:", "colour"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line(in_a_file: Path, old: str, new: str, expected_words: str):
+def test_errors_of_body_files(in_a_file: Path, old: str, new: str, expected_words: str):
     in_a_file.write_text(FILE.replace(old, new, 1))
     refused(in_a_file, expected_words.replace("{folder}", str(in_a_file.parent)))
 
 
-def test_arms_stand_at_places_that_are_all_given(tmp_path: Path):
+def test_arm_placements_must_all_be_given(tmp_path: Path):
     path, part_template = tmp_path / "pair.yaml", "{arm: panda, hand: allegro_left%s}"
     sides = ", at: {xyz: [0, 0.3, 0]}", ""
     text = (
@@ -242,12 +242,12 @@ def test_a_motor_of_two_sides_is_refused(
         ),
     ],
 )
-def test_what_is_wrong_with_parts_is_said(tmp_path: Path, old: str, new: str, expected_words: str):
+def test_errors_of_bodies_from_parts(tmp_path: Path, old: str, new: str, expected_words: str):
     path = tmp_path / "pair.yaml"
     path.write_text(BODY.replace(old, new, 1))
     refused(path, expected_words)
 
 
-def test_a_side_that_is_not_there_is_said():
+def test_missing_side_is_named():
     with pytest.raises(ik.errors.UnknownNameError, match=r"'middle'.*left, right"):
         ik.load_robot("g1+dex3").description.side("middle")

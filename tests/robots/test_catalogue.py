@@ -54,7 +54,7 @@ def test_every_hand_goes_on_an_arm(hand):
 
 
 @pytest.mark.parametrize("arm", PUBLISHED["arms"])
-def test_arms_stand_where_published_files_have_them(arm):
+def test_arms_match_published_files(arm):
     published = PUBLISHED["arms"][arm]
     robot = ik.load_robot(arm)
     tip = robot.description.joints[-1]  # fixed to the arm's last link
@@ -71,7 +71,7 @@ def test_arms_stand_where_published_files_have_them(arm):
 
 
 @pytest.mark.parametrize("hand", PUBLISHED["hands"])
-def test_hands_stand_where_published_files_have_them(hand):
+def test_hands_match_published_files(hand):
     published = PUBLISHED["hands"][hand]
     robot, q = ik.load_robot(hand), np.array(published["q"])
     poses = numpy_oracle.links(robot, dict(zip(published["joints"], q.T, strict=True)))
@@ -101,7 +101,7 @@ def test_unknown_robots_are_named(name, expected_words):
         ik.load_robot(name)
 
 
-def test_a_path_with_a_plus_is_a_path():
+def test_path_with_a_plus_is_a_path():
     with pytest.raises(ik.errors.DescriptionError, match="no such file"):
         ik.load_robot("a+b/robot.yaml")
 
@@ -136,7 +136,7 @@ def test_a_hand_alone_is_a_robot(name: str, rng: np.random.Generator) -> None:
     assert np.linalg.norm(points_reached - points, axis=2).max() <= 5e-3
 
 
-def test_a_hand_of_one_joint_says_where_it_is() -> None:
+def test_single_joint_hand_knows_its_pose() -> None:
     robot = ik.load_robot("so100_jaw")
     assert robot.joints([0.2]) == {"so100_jaw": 0.2}
     np.testing.assert_array_equal(robot.joints([[0.2], [0.3]])["so100_jaw"], [0.2, 0.3])
@@ -158,12 +158,12 @@ def test_an_arm_alone_is_a_robot_whose_fingertip_is_its_tip(rng: np.random.Gener
 
 
 @pytest.mark.parametrize("name", ["arm.urdf", "some/hand.xacro", "hand.xml"])
-def test_a_robots_file_is_led_to_its_import(name: str) -> None:
+def test_robot_file_suggests_import(name: str) -> None:
     with pytest.raises(ik.errors.DescriptionError, match=f"casadi-ik import {name} --out .*yaml"):
         ik.load_robot(name)
 
 
-def test_unknown_names_are_told_what_there_is() -> None:
+def test_unknown_names_list_the_alternatives() -> None:
     with pytest.raises(ik.errors.UnknownNameError, match="ARM\\+HAND"):
         ik.load_robot("no_such_robot")
 
@@ -194,7 +194,7 @@ def test_random_contacts_are_solved(pair: str, rng: np.random.Generator) -> None
     assert batch.success.all()
 
 
-def test_what_is_held_may_touch_the_fixed_jaw_but_not_what_it_is_fixed_to() -> None:
+def test_held_object_may_touch_the_fixed_jaw_only() -> None:
     """A ball between the tips is free; as far in as the motor it is not."""
     robot = ik.load_robot("ur5e+so100_jaw")
     q = robot.home.copy()
@@ -210,7 +210,7 @@ def test_what_is_held_may_touch_the_fixed_jaw_but_not_what_it_is_fixed_to() -> N
     assert free == [True, False]
 
 
-def test_a_pad_that_no_joint_moves_is_on_the_palms_link(tmp_path: Path) -> None:
+def test_fixed_pad_is_on_the_palm_link(tmp_path: Path) -> None:
     text = (MODELS / "hands" / "so100_jaw.yaml").read_text()
     (tmp_path / "hand.yaml").write_text(
         text.replace("palm: {link: so100_fixed_jaw", "palm: {link: so100_gripper")

@@ -146,7 +146,7 @@ def test_circle_of_links(tmp_path):
     assert "link 'one'" in message
 
 
-def test_missing_meshes_are_no_matter(tmp_path):
+def test_missing_meshes_are_tolerated(tmp_path):
     mesh = '<mesh filename="package://nowhere/left.stl"/>'
     shaped = f'<link name="left_1"><visual><geometry>{mesh}</geometry></visual></link>'
     hand(tmp_path, ('<link name="left_1"/>', shaped))
@@ -167,7 +167,7 @@ def test_formats_whose_reader_is_missing_name_the_extra(tmp_path, module, name):
     assert "pip install 'casadi-ik[robots]'" in done.stdout, done
 
 
-def test_a_robot_without_a_name_is_read_in_silence(tmp_path, capfd):
+def test_unnamed_robot_is_read_without_warning(tmp_path, capfd):
     path = hand(tmp_path)
     path.write_text(path.read_text().replace('<robot name="hand">', '<robot name="">'))
     ik.load_robot(describe(tmp_path, "hand: {file: hand.urdf}"))

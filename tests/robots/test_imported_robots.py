@@ -41,7 +41,7 @@ def check(robot, path, rng, locked=None, beside=None, carried_file=None):
     assert (robot.beyond_limits(q) <= 1e-9).all()
 
 
-def test_arm_and_hand_move_as_pinocchio_says(tmp_path, rng):
+def test_arm_and_hand_match_pinocchio(tmp_path, rng):
     robot = both(tmp_path)
     check(robot, tmp_path / "arm.urdf", rng)
     check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
@@ -66,7 +66,7 @@ def test_clashing_joints_of_the_hand_get_a_prefix(tmp_path, rng):
     check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
 
 
-def test_a_link_beyond_the_tip_may_be_called_like_one_of_the_hand(tmp_path, rng):
+def test_links_beyond_the_tip_may_share_names(tmp_path, rng):
     """An arm's file that ends in a `right_hand`, with which the hand's begins."""
     path, box = arm(tmp_path, 6), '<geometry><box size="0.3 0.2 0.1"/></geometry>'
     extra_link = f'<link name="left_tip"><collision>{box}</collision></link>'
@@ -82,7 +82,7 @@ def test_a_link_beyond_the_tip_may_be_called_like_one_of_the_hand(tmp_path, rng)
     assert "left_tip" not in shapes
 
 
-def test_meshes_meet_where_coal_says_so(rng):
+def test_mesh_contacts_match_coal(rng):
     coal = pytest.importorskip("coal")
     bodies = [
         trimesh.creation.icosphere(3, 1.0),
@@ -149,7 +149,7 @@ def test_one_file_with_its_palm(tmp_path, rng):
 MIMIC = '<mimic joint="left_spread" multiplier="-2" offset="0.3"/>'
 
 
-def test_a_follower_without_limits_goes_as_far_as_what_it_follows(tmp_path):
+def test_follower_without_limits_takes_those_of_its_leader(tmp_path):
     path = urdf(
         tmp_path / "hand.urdf",
         link("base_link", "left_1", "left_tip", "right_tip"),
@@ -172,14 +172,14 @@ def test_mimic_of_a_mimic(tmp_path, rng):
     assert angles["left_end"] == pytest.approx(0.5 * angles["right_end"] + 0.1)
 
 
-def test_joint_that_mimics_nothing_stands_still(tmp_path, rng):
+def test_joint_with_missing_leader_is_fixed(tmp_path, rng):
     change = ('joint="left_bend" multiplier="0.5"', 'joint="left_bend" multiplier="0"')
     robot = both(tmp_path, hand_changes=[change])
     assert "left_end" not in robot.joints(robot.home)
     check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
 
 
-def test_locked_joints_and_their_followers_stand_still(tmp_path, rng):
+def test_locked_joints_and_followers_are_fixed(tmp_path, rng):
     robot = both(tmp_path, hand_text=", locked: {left_bend: 0.4}")
     assert "left_bend" not in robot.actuators
     assert "left_end" not in robot.joints(robot.home)
@@ -187,7 +187,7 @@ def test_locked_joints_and_their_followers_stand_still(tmp_path, rng):
     check(robot, tmp_path / "hand.urdf", rng, locked, tmp_path / "arm.urdf")
 
 
-def test_limits_that_are_stated_go_before_the_files(tmp_path):
+def test_stated_limits_override_the_file(tmp_path):
     robot = both(tmp_path, arm_text=", limits: {joint_2: [-10 deg, 20 deg]}")
     np.testing.assert_allclose(np.rad2deg([robot.lower[1], robot.upper[1]]), [-10, 20])
 
@@ -240,7 +240,7 @@ def test_arm_from_a_file_with_a_shipped_hand(tmp_path, rng):
     check(robot, tmp_path / "arm.urdf", rng)
 
 
-def test_a_method_that_needs_a_thumb_says_so(tmp_path):
+def test_thumb_methods_refuse_hands_without_thumb(tmp_path):
     robot = both(tmp_path)
     with pytest.raises(ik.errors.UnsupportedError, match=r"thumb.*'thumb: FINGER'.*left"):
         ik.Solver(robot, "enhanced-dls")
@@ -333,7 +333,7 @@ def mjcf(tmp_path):
     return describe(tmp_path, "hand: {file: hand.xml, palm: palm}")
 
 
-def test_mjcf_moves_as_mujoco_says(mjcf, rng):
+def test_mjcf_matches_mujoco(mjcf, rng):
     robot = ik.load_robot(mjcf)
     assert robot.actuators == ("wrist_a", "wrist_b", "left_a", "right_c", "pull")
     assert robot.description.arm_actuators == (0, 1)
@@ -352,7 +352,7 @@ def test_equality_is_a_polynomial_of_displacements(mjcf, rng):
     )
 
 
-def test_tendon_is_a_motor_that_its_joints_share_by_their_ranges(mjcf, rng):
+def test_tendon_is_a_shared_motor(mjcf, rng):
     robot = ik.load_robot(mjcf)
     q = robot.random(rng, 10)
     joints = robot.joints(q)
@@ -361,7 +361,7 @@ def test_tendon_is_a_motor_that_its_joints_share_by_their_ranges(mjcf, rng):
     np.testing.assert_allclose([robot.lower[4], robot.upper[4]], [0, 3.1], atol=1e-9)
 
 
-def test_meshes_that_cannot_be_read_are_left_out_of_an_mjcf(mjcf, rng):
+def test_unreadable_mjcf_meshes_are_skipped(mjcf, rng):
     path = mjcf.parent / "hand.xml"
     flat = "0 0 0  0.01 0 0  0 0.01 0  0.01 0.01 1e-9"
     assets = f"""<asset><mesh name="gone" file="assets/gone.stl"/>
@@ -445,7 +445,7 @@ def test_a_maker_s_macros_are_expanded_with_arguments(tmp_path):
     "expression",
     ["open('/etc/passwd')", "''.__class__", "'x'.format(1)", "[].append(1)", "dict.x"],
 )
-def test_expressions_that_are_not_evaluated(tmp_path, expression):
+def test_unsafe_expressions_are_not_evaluated(tmp_path, expression):
     write_xacro(tmp_path, XACRO.replace("len(kinds) != 2", expression))
     text = "hand: {file: clone/robots/my.urdf.xacro, xacro: ['height:=0.05']}"
     with pytest.raises(ik.errors.DescriptionError, match=r"is not (evaluated|defined)"):

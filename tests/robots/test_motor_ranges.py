@@ -58,7 +58,7 @@ def narrow_barrett(folder):
     return ik.load_robot(path)
 
 
-def test_no_random_configuration_is_beyond_a_joint_limit(narrow, rng):
+def test_random_configurations_keep_joint_limits(narrow, rng):
     assert narrow.beyond_limits(narrow.random(rng, 20_000)).max() <= 1e-9
 
 
@@ -78,14 +78,14 @@ def test_the_range_is_as_wide_as_the_joints_allow(narrow):
     assert narrowed == {"spread", "screw_1", "screw_2", "thumb_bend"}
 
 
-def test_shipped_robots_keep_their_strokes_to_the_last_digit():
+def test_shipped_robots_keep_their_exact_strokes():
     for name in ik.shipped_names("arm_hands"):
         robot = ik.load_robot(name)
         np.testing.assert_array_equal(robot.lower, robot.description.actuator_limits[0])
         np.testing.assert_array_equal(robot.upper, robot.description.actuator_limits[1])
 
 
-def test_numbers_are_those_of_the_graphs(rng):
+def test_numbers_match_the_graphs(rng):
     bar = FourBar("x", 0.0297, 0.0347, 0.0084, 0.0072, 3.32939008, 4.1110)
     screw = LeadScrew("x", 0.0522, 0.013, 0.58)
     for coupling, low, high in ((bar, -4, 4), (screw, 0.03, 0.07), (Linear("x", -0.5, 0.1), -1, 1)):
@@ -97,7 +97,7 @@ def test_numbers_are_those_of_the_graphs(rng):
         np.testing.assert_allclose(coupling.followed(values), expected, atol=1e-12)
 
 
-def test_a_joint_that_turns_back(tmp_path):
+def test_non_monotonic_coupling_keeps_the_interval_of_home(tmp_path):
     """A four-bar's output turns where rod and ground align: the interval of home is kept."""
     path = narrow_robot(tmp_path)
     hand = yaml.safe_load((tmp_path / "parts" / "hand.yaml").read_text())
@@ -126,7 +126,7 @@ def test_a_joint_that_turns_back(tmp_path):
         assert robot.beyond_limits(robot.random(np.random.default_rng(0), 5000)).max() <= 1e-9
 
 
-def test_a_motor_with_nowhere_to_go(tmp_path):
+def test_motor_without_range_is_refused(tmp_path):
     path = narrow_robot(tmp_path)
     hand = tmp_path / "parts" / "hand.yaml"
     data = yaml.safe_load(hand.read_text())
@@ -136,7 +136,7 @@ def test_a_motor_with_nowhere_to_go(tmp_path):
         ik.load_robot(path)
 
 
-def test_home_beyond_a_joint_limit(tmp_path):
+def test_home_beyond_a_limit_is_refused(tmp_path):
     path = narrow_robot(tmp_path)
     path.write_text(path.read_text().replace("spread: 0.2", "spread: 0.8"))
     with pytest.raises(
@@ -145,7 +145,7 @@ def test_home_beyond_a_joint_limit(tmp_path):
         ik.load_robot(path)
 
 
-def test_home_that_is_not_given_is_within(tmp_path):
+def test_default_home_is_within_limits(tmp_path):
     path = narrow_robot(tmp_path)
     path.write_text(path.read_text().split("home:")[0])
     robot = ik.load_robot(path)
@@ -155,7 +155,7 @@ def test_home_that_is_not_given_is_within(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [ik.Tolerance(), ik.Tolerance(1e-6, 1e-6)])
 @pytest.mark.parametrize("method", ["hand-first", "thumb-first"])
-def test_no_solve_ends_at_a_follower_beyond_its_limit(tmp_path, rng, method, tolerance):
+def test_solutions_keep_follower_limits(tmp_path, rng, method, tolerance):
     robot = narrow_barrett(tmp_path)
     q = robot.random(rng, 60)
     for end in (robot.lower, robot.upper) if method == "hand-first" else ():
@@ -167,7 +167,7 @@ def test_no_solve_ends_at_a_follower_beyond_its_limit(tmp_path, rng, method, tol
     assert robot.beyond_limits(batch.q).max() <= 1e-9
 
 
-def test_where_limits_are_ignored_the_joints_are_free(tmp_path, rng):
+def test_ignored_limits_free_the_joints(tmp_path, rng):
     robot = narrow_barrett(tmp_path)
     wide = ik.load_robot("kuka_lwr_barrett_coupled")
     points, normals = wide.contacts(wide.random(rng, 60))

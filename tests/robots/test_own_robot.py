@@ -36,7 +36,7 @@ def test_mount_turns_and_shifts_the_hand(own_robot, robot, rng):
     )
 
 
-def test_joints_may_stand_in_any_order(tmp_path, rng):
+def test_joint_order_is_free(tmp_path, rng):
     path = copy_shipped_robot(tmp_path)
     hand = tmp_path / "hand.yaml"
     lines = hand.read_text().split("joints:\n")
@@ -93,7 +93,7 @@ def test_couplings_follow_their_closed_formulas(coupled_robot, rng):
         assert np.ptp(values) > 1e-3
 
 
-def test_actuators_of_a_finger_see_through_the_couplings(coupled_robot):
+def test_finger_actuators_follow_the_couplings(coupled_robot):
     description = coupled_robot.description
     assert description.finger_actuators("left") == (0, 1, 2)
     assert description.finger_actuators("right") == (0, 2)
@@ -115,7 +115,7 @@ def test_finger_begins_at_the_palm(tmp_path):
     assert finger.joints == ("thumb_slide", "thumb_bend")
 
 
-def test_sources_of_the_same_tag_are_told_apart(own_robot):
+def test_sources_with_the_same_tag_are_distinguished(own_robot):
     arm = own_robot.with_name("arm.yaml")
     replace(arm, "  centro:", "  mdh: of the arm\n  centro:")
     sources = ik.load_robot(own_robot).description.sources
@@ -123,7 +123,7 @@ def test_sources_of_the_same_tag_are_told_apart(own_robot):
     assert "Craig" in sources["barrett_bh8_280.mdh"]
 
 
-def test_any_name_of_robot_and_fingers_will_do(tmp_path, rng):
+def test_names_are_arbitrary(tmp_path, rng):
     path = copy_shipped_robot(tmp_path)
     replace(path, "name: kuka_lwr_barrett", 'name: "7 dwarfs & a hand-1"')
     replace(path, "[thumb, finger_2", "[thumb, ring-finger")
@@ -142,7 +142,7 @@ def test_any_name_of_robot_and_fingers_will_do(tmp_path, rng):
     assert 'name="7 dwarfs &amp; a hand-1"' in own_robot_model.urdf()
 
 
-def test_load_robot_says_what_is_wrong():
+def test_robot_errors_are_specific():
     with pytest.raises(ik.CasadiIKError, match=r"'kuka'"):
         ik.load_robot("kuka")
 
@@ -175,7 +175,7 @@ def in_full(folder: Path, name: str = "kuka_lwr_barrett", **changes: Any) -> Pat
 
 
 @pytest.mark.parametrize("name", ["kuka_lwr_barrett", "ar10"])
-def test_it_is_the_same_robot(name, tmp_path, rng):
+def test_full_description_gives_the_same_robot(name, tmp_path, rng):
     robot_in_full, named = ik.load_robot(in_full(tmp_path, name)), ik.load_robot(name)
     assert robot_in_full.actuators == named.actuators
     q = named.random(rng, 5)
@@ -191,14 +191,14 @@ def test_it_is_the_same_robot(name, tmp_path, rng):
         ({"colour": "red"}, "hand: object contains unknown field `colour`"),
     ],
 )
-def test_its_errors_name_the_file_and_the_key(changes, words, tmp_path):
+def test_errors_name_file_and_key(changes, words, tmp_path):
     path = in_full(tmp_path, **changes)
     with pytest.raises(ik.errors.DescriptionError, match=words) as caught:
         ik.load_robot(path)
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_neither_a_name_nor_a_hand(tmp_path):
+def test_missing_name_and_hand_are_refused(tmp_path):
     path = tmp_path / "whole.yaml"
     path.write_text("name: a\nhand: 3\nthumb: b\nfingers: [b]\n")
     with pytest.raises(

@@ -92,7 +92,7 @@ def test_contacts_by_denavit_hartenberg(robot, rng):
             np.testing.assert_allclose(normals[row, column], expected[:3, 2], atol=1e-12)
 
 
-def test_palm_stands_on_frame_w_on_the_flange(robot, rng):
+def test_palm_frame_is_on_the_flange(robot, rng):
     """Frame W is the flange's; the palm frame is parallel to it, on the palm's surface."""
     for q in robot.random(rng, 10):
         flange, surface = lwr(q[:7]), np.eye(4)
@@ -247,7 +247,7 @@ def test_unknown_names_list_the_known(robot):
         robot.description.chain("x")
 
 
-def test_what_was_worked_out_of_a_description_is_no_part_of_it() -> None:
+def test_derived_data_are_not_pickled() -> None:
     """Else every solver would have kernels of its own."""
     description = ik.load_robot("kuka_lwr_barrett").description
     data_before = pickle.dumps(description)
@@ -274,7 +274,7 @@ def test_arm_and_mount(baxter, rng):
         np.testing.assert_allclose(baxter.links(q)["hand_base"], hand, atol=1e-14)
 
 
-def test_the_hand_is_the_ar10(baxter, rng):
+def test_hand_equals_the_ar10(baxter, rng):
     hand_alone = ik.load_robot("ar10")
     assert baxter.actuators[7:] == hand_alone.actuators
     assert baxter.actuators[:7] == (
@@ -329,7 +329,7 @@ def test_distal_joints_follow_within_their_limits(coupled, rng):
     np.testing.assert_allclose(np.degrees(joints["bh_thumb_distal"][-2]), 140 / 3, rtol=1e-12)
 
 
-def test_the_same_hand_otherwise(coupled, robot, rng):
+def test_coupled_hand_matches_the_uncoupled(coupled, robot, rng):
     q = coupled.random(rng, 20)
     ours, theirs = coupled.contacts(q), robot.contacts(independent(coupled, robot, q))
     np.testing.assert_allclose(ours[0], theirs[0], atol=1e-14)
@@ -340,7 +340,7 @@ def test_the_same_hand_otherwise(coupled, robot, rng):
 
 
 @pytest.mark.parametrize("method", ["enhanced-dls", "enhanced-sdls"])
-def test_the_papers_methods_say_why_not(coupled, method):
+def test_paper_methods_explain_refusal(coupled, method):
     """Eq. (5) distributes a sum over two flexions; here there is nothing to distribute."""
     with pytest.raises(ik.errors.UnsupportedError) as caught:
         ik.Solver(coupled, method)
@@ -350,7 +350,7 @@ def test_the_papers_methods_say_why_not(coupled, method):
     )
 
 
-def test_other_grasps_are_out_of_its_reach(coupled, robot):
+def test_grasps_of_other_robots_are_unreachable(coupled, robot):
     """Fifteen equations for eleven motors: a cup pinched with free distal joints does not fit."""
     grasp = ik.load_grasp("cup")
     assert ik.Solver(robot).solve(grasp).success

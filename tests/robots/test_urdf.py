@@ -68,14 +68,14 @@ def test_mimic_joints_stand_for_the_linear_couplings(pair, rng):
             np.testing.assert_allclose(pose, frame_pose, atol=1e-12, err_msg=name)
 
 
-def test_something_is_drawn_of_every_part(robot):
+def test_every_part_has_a_visual(robot):
     tree = ElementTree.fromstring(robot.urdf())
     lengths = [float(node.get("length")) for node in tree.iter("cylinder")]
     assert len(lengths) > 15
     assert all(0.005 < length < 0.5 for length in lengths)
 
 
-def test_couplings_without_a_urdf_form_are_said(pair):
+def test_couplings_without_urdf_form_are_noted(pair):
     robot, _ = pair
     text = robot.urdf()
     for joint in robot.description.movable:

@@ -18,7 +18,7 @@ def contains(interval, swivels):
     return np.mod(swivels - start, 2 * np.pi) <= end - start
 
 
-def test_they_are_solutions_and_they_differ(robot, solver):
+def test_alternatives_are_distinct_solutions(robot, solver):
     points_asked = robot.random(np.random.default_rng(11), 5)
     for q in points_asked:
         solutions = solver.solve_all(grasp_at(robot, q), limit=100, apart=0)
@@ -57,7 +57,7 @@ def min_difference(robot, solutions):
 
 
 @pytest.mark.parametrize("prefer", ["limits", "manipulability", "q0"])
-def test_the_answers_for_the_cup_are_different_ones(robot, solver, prefer):
+def test_cup_alternatives_differ(robot, solver, prefer):
     """Its hand has a valley of postures; without a least distance they fill the list."""
     cup = ik.load_grasp("cup")
     all_solutions = solver.solve_all(cup, limit=1000, prefer=prefer, apart=0)
@@ -79,7 +79,7 @@ def test_the_answers_for_the_cup_are_different_ones(robot, solver, prefer):
 
 
 @pytest.mark.slow
-def test_how_different_they_are_is_a_parameter():
+def test_min_separation_is_a_parameter():
     """On a robot whose arm is only nearly of a closed form."""
     robot = ik.load_robot("baxter_ar10")
     grasp = grasp_at(robot, robot.random(np.random.default_rng(1), 1)[0])
@@ -102,7 +102,7 @@ def test_how_different_they_are_is_a_parameter():
         ("q0", lambda solution: -solution.distance),
     ],
 )
-def test_the_preferred_comes_first(robot, solver, prefer, measure):
+def test_preferred_solution_is_first(robot, solver, prefer, measure):
     q = robot.random(np.random.default_rng(21), 1)[0]
     all_solutions = solver.solve_all(grasp_at(robot, q), limit=100, prefer=prefer, q0=q)
     values = [measure(solution) for solution in all_solutions]
@@ -117,14 +117,14 @@ def test_the_preferred_comes_first(robot, solver, prefer, measure):
     ]
 
 
-def test_the_robot_is_close_to_itself(robot, solver):
+def test_generating_configuration_is_nearest(robot, solver):
     q = robot.random(np.random.default_rng(31), 1)[0]
     nearest = solver.solve_all(grasp_at(robot, q), prefer="q0", q0=q)[0]
     assert nearest.distance < 0.01
     np.testing.assert_allclose(nearest.q, q, atol=0.05)
 
 
-def test_manipulability_is_yoshikawas(robot, solver):
+def test_manipulability_is_the_yoshikawa_measure(robot, solver):
     q = robot.random(np.random.default_rng(41), 1)[0]
     solution = solver.solve_all(grasp_at(robot, q), prefer="q0", q0=q)[0]
     step, columns = 1e-6, []
@@ -138,7 +138,7 @@ def test_manipulability_is_yoshikawas(robot, solver):
     assert solution.manipulability == pytest.approx(np.sqrt(np.linalg.det(J @ J.T)), rel=1e-4)
 
 
-def test_a_held_elbow_leaves_single_swivels(robot, solver):
+def test_fixed_elbow_gives_single_swivels(robot, solver):
     q = robot.random(np.random.default_rng(51), 1)[0]
     fixed = {"lwr_joint_3": float(q[2])}
     solutions = solver.solve_all(grasp_at(robot, q), fixed=fixed)
@@ -160,12 +160,12 @@ def test_an_arm_without_a_closed_form(tmp_path_factory):
     )
 
 
-def test_none_where_there_is_none(robot, solver):
+def test_unreachable_grasp_has_no_alternatives(robot, solver):
     points, normals = robot.contacts(robot.home)
     assert solver.solve_all(grasp_of(robot, points + 5.0, normals)) == ()
 
 
-def test_what_is_refused(robot, solver):
+def test_bad_alternative_options_are_refused(robot, solver):
     grasp = grasp_at(robot, robot.home)
     with pytest.raises(ik.errors.InputError, match=r"limit:.*0.*>= 1"):
         solver.solve_all(grasp, limit=0)

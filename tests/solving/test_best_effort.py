@@ -24,7 +24,7 @@ def distances(solver, points, normals, q):
 
 
 @pytest.mark.parametrize("name", ["ur5e", "kuka_lwr_barrett"])
-def test_no_start_of_another_optimiser_comes_nearer(name):
+def test_no_other_optimiser_comes_nearer(name):
     robot = ik.load_robot(name)
     solver, rng = ik.Solver(robot), np.random.default_rng(3)
     points, normals = out_of_reach(robot, 6, factor=2.5)
@@ -47,7 +47,7 @@ def test_no_start_of_another_optimiser_comes_nearer(name):
             assert start_distances[row] <= 2 * best.cost * (1 + 1e-6)
 
 
-def test_the_error_ratio_says_how_far_outside(robot):
+def test_error_ratio_measures_the_excess(robot):
     solver = ik.Solver(robot)
     points, normals = out_of_reach(robot, 3)
     batch = solver.solve_batch(points, normals, best_effort=True)
@@ -65,14 +65,14 @@ def test_the_error_ratio_says_how_far_outside(robot):
         assert (solution.error_ratio <= 1) == solution.success
 
 
-def test_solved_targets_are_as_without_best_effort(robot, rng):
+def test_solved_targets_are_unchanged(robot, rng):
     solver = ik.Solver(robot)
     points, normals = robot.contacts(robot.random(rng, 50))
     plain = solver.solve_batch(points, normals)
     np.testing.assert_array_equal(plain.q, solver.solve_batch(points, normals, best_effort=True).q)
 
 
-def test_a_palm_out_of_reach_keeps_the_hand(robot, rng):
+def test_unreachable_palm_keeps_the_hand(robot, rng):
     solver, q = ik.Solver(robot), robot.random(rng, 8)
     palms = robot.palm(q)
     palms[:, :3, 3] *= 2
@@ -90,7 +90,7 @@ def test_the_nearest_configuration_is_free_of_collisions(robot):
     assert (batch.clearance[is_nearest] > 0).all()
 
 
-def test_fixed_motors_stay(robot):
+def test_fixed_motors_stay_fixed(robot):
     solver = ik.Solver(robot)
     points, normals = out_of_reach(robot, 3)
     batch = solver.solve_batch(points, normals, fixed={"lwr_joint_3": 0.2}, best_effort=True)
@@ -109,7 +109,7 @@ def pose_residual(robot, pose, tolerance):
     return residual
 
 
-def test_an_arm_that_is_led_out_of_reach_stays_on_its_branch():
+def test_arm_led_out_of_reach_stays_on_its_branch():
     robot = ik.load_robot("ur5e")
     solver, q = ik.Solver(robot), robot.home
     points, normals = robot.contacts(q)
@@ -127,7 +127,7 @@ def test_an_arm_that_is_led_out_of_reach_stays_on_its_branch():
     assert set(statuses[-40:]) == {ik.Status.NEAREST}
 
 
-def test_a_local_descent_to_a_far_target_does_not_jump_to_limits():
+def test_local_descent_does_not_jump_to_limits():
     robot = ik.load_robot("ur5e")
     frame = robot.contact_frames(robot.home)[0].copy()
     frame[:3, 3] = 9.0
@@ -139,7 +139,7 @@ def test_a_local_descent_to_a_far_target_does_not_jump_to_limits():
     assert np.abs(local.q - robot.home).max() < np.pi
 
 
-def test_a_five_axis_arm_follows_poses_that_it_cannot_have():
+def test_five_axis_arm_follows_infeasible_poses():
     """Each answer is a minimum near the last one: no step is omitted, and none is a jump."""
     robot = ik.load_robot("viperx_300s")
     fixed = {name: float(robot.home[i]) for i, name in enumerate(robot.actuators[:1])}
@@ -162,6 +162,6 @@ def test_a_five_axis_arm_follows_poses_that_it_cannot_have():
 
 
 @pytest.mark.parametrize("value", ["global", 2, None])
-def test_another_value_is_refused(robot, value):
+def test_unknown_best_effort_is_refused(robot, value):
     with pytest.raises(ik.errors.InputError, match=f"best_effort.*{value!r}"):
         ik.Solver(robot).solve_batch(*robot.contacts(robot.home[None]), best_effort=value)

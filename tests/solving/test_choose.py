@@ -48,7 +48,7 @@ def scored(robot, q, prefer, q0):
 
 
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
-def test_the_order_is_that_of_the_score(solver, robot, candidates, cup, prefer):
+def test_ranking_is_sorted_by_score(solver, robot, candidates, cup, prefer):
     ranked = solver.choose(candidates, cup.object_pose, robot.home, 20, prefer, per_candidate=None)
     q = np.stack([choice.solution.q for choice in ranked])
     scores = np.array([choice.score for choice in ranked])
@@ -63,7 +63,7 @@ def test_the_order_is_that_of_the_score(solver, robot, candidates, cup, prefer):
     assert ranked[0].score == pytest.approx(best, abs=1e-9)
 
 
-def test_answers_meet_their_candidates_and_differ(solver, robot, candidates, cup):
+def test_answers_solve_their_candidates_and_differ(solver, robot, candidates, cup):
     ranked = solver.choose(candidates, object_pose=cup.object_pose, limit=30)
     parts = []
     for choice in ranked:
@@ -82,7 +82,7 @@ def test_answers_meet_their_candidates_and_differ(solver, robot, candidates, cup
     assert len(alike) == alike.answered >= len(ranked)
 
 
-def test_one_answer_of_a_candidate_unless_asked(solver, candidates, cup):
+def test_per_candidate_limits_the_answers(solver, candidates, cup):
     for max_solutions, prefer in ((1, None), (2, None), (2, "manipulability"), (None, None)):
         ranked = solver.choose(
             candidates,
@@ -97,7 +97,7 @@ def test_one_answer_of_a_candidate_unless_asked(solver, candidates, cup):
         assert ranked.answered == np.count_nonzero(places)
 
 
-def test_a_candidate_in_the_objects_frame_is_the_one_moved_to_it(solver, candidates, cup):
+def test_object_frame_candidates_match_moved_ones(solver, candidates, cup):
     placed = [candidate.at(cup.object_pose) for candidate in candidates]
     ranked_placed = solver.choose(placed)
     ranked_by_pose = solver.choose(candidates, object_pose=cup.object_pose)
@@ -123,7 +123,7 @@ def test_a_candidate_in_the_objects_frame_is_the_one_moved_to_it(solver, candida
     )
 
 
-def test_answers_are_free_for_coal(careful, robot, candidates, cup):
+def test_answers_are_collision_free_for_coal(careful, robot, candidates, cup):
     ranked = careful.choose(candidates, object_pose=cup.object_pose, limit=20)
     assert len(ranked) >= 3
     shapes = robot.description.shapes.capsules
@@ -172,7 +172,7 @@ def test_reasons_are_counted(robot, candidates, cup):
     assert "0 of 13 " in str(ranked)
 
 
-def test_of_a_given_hand_the_arm_alone_is_ranked(solver, robot, rng):
+def test_given_hand_ranks_the_arm_alone(solver, robot, rng):
     """The hand's distance from its limits is nobody's choice."""
     hand = slice(7, None)
     q = robot.random(rng, 30)
@@ -193,7 +193,7 @@ def test_of_a_given_hand_the_arm_alone_is_ranked(solver, robot, rng):
     assert len({q_row.candidate for q_row in ranked}) == 5
 
 
-def test_a_preference_of_ones_own(solver, robot, candidates, cup):
+def test_custom_preference(solver, robot, candidates, cup):
     def straight(robot_asked: ik.ArmHand, q: np.ndarray) -> np.ndarray:
         assert robot_asked.name == robot.name
         return -np.abs(q[:, 0])
@@ -206,7 +206,7 @@ def test_a_preference_of_ones_own(solver, robot, candidates, cup):
     assert ranked[0].score >= max(-abs(choice.solution.q[0]) for choice in usual)
 
 
-def test_the_arms_measure_and_clearance_rank_too(solver, careful, candidates, cup):
+def test_manipulability_and_clearance_rank(solver, careful, candidates, cup):
     for ranking_solver, prefer in ((solver, "manipulability"), (careful, "clearance")):
         scores = [
             c.score for c in ranking_solver.choose(candidates, cup.object_pose, prefer=prefer)
@@ -216,7 +216,7 @@ def test_the_arms_measure_and_clearance_rank_too(solver, careful, candidates, cu
         assert scores[0] > 0
 
 
-def test_grasps_with_other_fingers_rank_together(solver, candidates, cup):
+def test_grasps_with_different_fingers_rank_together(solver, candidates, cup):
     pinch = ik.Grasp(
         {name: candidates[0].contacts[name] for name in ("thumb", "finger_2")}, object=cup.object
     )
@@ -225,7 +225,7 @@ def test_grasps_with_other_fingers_rank_together(solver, candidates, cup):
     assert 0 in {choice.candidate for choice in ranked}
 
 
-def test_bad_questions_are_one_clear_line(solver, robot, candidates, cup):
+def test_bad_choices_are_refused(solver, robot, candidates, cup):
     skewed = np.eye(4)
     skewed[0, 0] = 2.0
     unknown = np.eye(4)

@@ -66,7 +66,7 @@ def stretched(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
     return q
 
 
-def test_solved_has_none(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
+def test_solved_targets_have_no_diagnosis(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
     assert solver.solve(ik.load_grasp("cup")).diagnosis is None
     assert solver.solve_batch(cup[0][None], cup[1][None]).diagnoses == ()
     assert solver.solve_batch(cup[0][None], cup[1][None], diagnose=True).diagnoses == (None,)
@@ -132,7 +132,7 @@ def test_normal_that_faces_away(
             assert np.linalg.norm((n - normals)[other_columns], axis=1).max() <= np.deg2rad(3)
 
 
-def test_a_grasp_that_says_where_its_object_is(solver: ik.Solver) -> None:
+def test_diagnosis_uses_the_object_pose(solver: ik.Solver) -> None:
     """One pose of the object, several targets to be tried."""
     grasp = ik.load_grasp("cup")
     up = np.eye(4)
@@ -147,7 +147,7 @@ def test_a_grasp_that_says_where_its_object_is(solver: ik.Solver) -> None:
     assert solver.track([grasp, grasp.at(up)], period=0.1).success.all()
 
 
-def test_one_limit_blocks(solver: ik.Solver, robot: ik.ArmHand) -> None:
+def test_single_limit_is_named(solver: ik.Solver, robot: ik.ArmHand) -> None:
     """An actuator 5 deg beyond its limit and all others mid-range; brute force finds no other way.
 
     Every relief is proved by its solution, and asks for no more than those 5 degrees.
@@ -180,7 +180,9 @@ def test_one_limit_blocks(solver: ik.Solver, robot: ik.ArmHand) -> None:
     assert blocked == len(names)
 
 
-def test_barely_reachable_is_never_unreachable(solver: ik.Solver, robot: ik.ArmHand) -> None:
+def test_barely_reachable_targets_are_never_unreachable(
+    solver: ik.Solver, robot: ik.ArmHand
+) -> None:
     rng = np.random.default_rng(11)
     for q in (
         at_limits(robot, rng, 2000, 0.4),
@@ -200,7 +202,7 @@ def test_reachable_thanks_to_tolerance(solver: ik.Solver, robot: ik.ArmHand) -> 
         assert batch.success.mean() > 0.99
 
 
-def test_agrees_with_brute_force(solver: ik.Solver, robot: ik.ArmHand) -> None:
+def test_diagnosis_matches_brute_force(solver: ik.Solver, robot: ik.ArmHand) -> None:
     """Whole grasps shifted, contacts shifted, normals turned: about half can be reached."""
     rng = np.random.default_rng(13)
     points, normals = robot.contacts(robot.random(rng, 40))
@@ -225,7 +227,7 @@ def test_agrees_with_brute_force(solver: ik.Solver, robot: ik.ArmHand) -> None:
     assert np.quantile(ratios, 0.9) < 1.5
 
 
-def test_other_methods_ask_hand_first(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
+def test_other_methods_use_hand_first(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
     """Not converging says nothing about reach."""
     options = {"max_iterations": 2}
     paper = ik.Solver(robot, "enhanced-dls", finger_step="closed-form", options=options)
@@ -270,7 +272,7 @@ def impossible(robot: ik.ArmHand, count: int) -> tuple[Array, Array]:
     return points, normals
 
 
-def test_in_a_batch_as_alone(solver: ik.Solver, robot: ik.ArmHand) -> None:
+def test_batch_diagnoses_match_single_ones(solver: ik.Solver, robot: ik.ArmHand) -> None:
     points, normals = impossible(robot, 4)
     batch = solver.solve_batch(points, normals, diagnose=True)
     threads = solver.solve_batch(points, normals, diagnose=True, jobs=2)
@@ -286,7 +288,7 @@ def test_in_a_batch_as_alone(solver: ik.Solver, robot: ik.ArmHand) -> None:
             np.testing.assert_array_equal(diagnosis.q, expected_diagnosis.q)
 
 
-def test_pickled_with_what_would_help(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
+def test_remedies_survive_pickling(solver: ik.Solver, cup: tuple[Array, Array]) -> None:
     normals = cup[1] * np.array([[-1], [1], [1]])
     diagnosis = diagnosed(solver, cup[0], normals)
     copy = pickle.loads(pickle.dumps(diagnosis))

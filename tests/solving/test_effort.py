@@ -21,7 +21,7 @@ def far_targets(robot):
     return points, normals
 
 
-def test_rounds_are_limited(robot, far_targets):
+def test_restarts_are_limited(robot, far_targets):
     usual = ik.Solver(robot).solve_batch(*far_targets)
     solver = ik.Solver(robot, options={"max_rounds": 1})
     batch, fast = solver.solve_batch(*far_targets), solver.fast()
@@ -37,7 +37,7 @@ def test_rounds_are_limited(robot, far_targets):
             np.testing.assert_array_equal(q, near_batch.q[row])
 
 
-def test_what_is_no_limit(robot):
+def test_invalid_limits_are_refused(robot):
     for value in (0, -1, 1.5, True):
         with pytest.raises(errors.InputError, match="expected a whole number >= 1"):
             ik.Solver(robot, options={"max_rounds": value})
@@ -75,7 +75,7 @@ def test_postures_are_names_or_whole_configurations(robot, rng):
         solver.solve_palms(palms, "open")
 
 
-def test_an_answer_of_fast_stays(robot, far_targets):
+def test_fast_answer_is_not_overwritten(robot, far_targets):
     fast = ik.Solver(robot).fast()
     first, _ = fast(far_targets[0][40], far_targets[1][40])
     answer_before = first.copy()
@@ -83,7 +83,7 @@ def test_an_answer_of_fast_stays(robot, far_targets):
     np.testing.assert_array_equal(first, answer_before)
 
 
-def test_q0_in_degrees_is_noticed(robot):
+def test_q0_in_degrees_is_detected(robot):
     grasp, solver = ik.load_grasp("cup"), ik.Solver(robot)
     message = "q0: lwr_joint_2 is 30 rad, far beyond its limits .* rad; degrees are np.deg2rad"
     with pytest.warns(UserWarning, match=message):

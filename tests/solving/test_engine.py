@@ -60,7 +60,7 @@ def test_limits_are_part_of_success_where_enforced(robot, enforce):
 @pytest.mark.parametrize(
     "status", [ik.Status.ITERATION_LIMIT, ik.Status.STALLED, ik.Status.INVALID]
 )
-def test_the_verdict_outvotes_the_method(robot, status):
+def test_verdict_overrides_the_method(robot, status):
     """What meets its contacts is solved; what does not keeps the method's word for it."""
     q = np.tile(robot.home, (2, 1))
     goals = q.copy()
@@ -89,7 +89,7 @@ def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
         np.testing.assert_array_equal(last["status"], batch.status[rows])
 
 
-def test_a_quick_answer_has_every_field(robot: ik.ArmHand) -> None:
+def test_solution_has_every_field(robot: ik.ArmHand) -> None:
     solution = ik.Solver(robot).solve(grasp_at(robot, robot.home))
     for result in (solution, *solution.contacts.values()):
         needed = {f.name for f in dataclasses.fields(result) if f.default is dataclasses.MISSING}
@@ -136,7 +136,7 @@ def limits_ok(robot, q):
     return judge(robot, problems(points[None], normals[None]), q).limits_ok
 
 
-def test_what_is_free_is_met(robot):
+def test_free_components_are_met(robot):
     points, normals = (x[None].copy() for x in robot.contacts(robot.home))
     points[0, 0] = normals[0, 0] = normals[0, 1] = np.nan
     points[0, 2] += 1.0

@@ -27,7 +27,7 @@ def targets(robot):
 
 @pytest.mark.parametrize("limits", ["enforce", "ignore"])
 @pytest.mark.parametrize("starts_near", [False, True])
-def test_bit_for_bit_as_in_a_batch(robot, targets, limits, starts_near):
+def test_fast_matches_batch_bit_for_bit(robot, targets, limits, starts_near):
     solver = ik.Solver(robot, tolerance=ik.Tolerance(1e-6, 1e-6), limits=limits)
     q0 = robot.home + 0.01 if starts_near else None
     fast, batch = solver.fast(), solver.solve_batch(*targets, q0=q0)
@@ -66,7 +66,7 @@ def test_one_instance_per_thread(robot, targets):
         (lambda p, n: (p * np.nan, n * np.nan), "row 0 has no contact"),
     ],
 )
-def test_a_malformed_target_is_refused_in_words(robot, targets, change, message):
+def test_malformed_target_is_refused(robot, targets, change, message):
     points, normals = targets[0][100], targets[1][100]
     fast = ik.Solver(robot).fast()
     with pytest.raises(errors.InputError, match=message):
@@ -76,14 +76,14 @@ def test_a_malformed_target_is_refused_in_words(robot, targets, change, message)
         fast(points, normals, np.full(14, np.nan))
 
 
-def test_lengths_beyond_those_whose_squares_are_numbers(robot, targets):
+def test_extreme_normal_lengths_are_accepted(robot, targets):
     points, normals = targets[0][100], targets[1][100]
     fast = ik.Solver(robot).fast()
     q = fast(points, normals)[0].copy()
     np.testing.assert_allclose(fast(points, normals * 1e-200)[0], q, atol=1e-12)
 
 
-def test_without_a_compiler_it_is_slow_but_right(robot, targets):
+def test_works_without_a_compiler(robot, targets):
     points, normals = targets[0][100], targets[1][100]
     expected, _ = ik.Solver(robot).fast()(points, normals)
     q, status = ik.Solver(robot, compiled=False).fast()(points, normals)
@@ -91,6 +91,6 @@ def test_without_a_compiler_it_is_slow_but_right(robot, targets):
     assert status is ik.Status.SOLVED
 
 
-def test_only_hand_first(robot):
+def test_only_hand_first_is_fast(robot):
     with pytest.raises(errors.UnsupportedError, match=r"'hand-first'.*'thumb-first'"):
         ik.Solver(robot, method="thumb-first").fast()

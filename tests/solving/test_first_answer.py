@@ -61,9 +61,7 @@ def workers(cache: Path) -> list[int]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", ["None", "ik.load_scene('table')"])
-def test_the_virtual_machine_answers_until_there_is_compiled_code(
-    tmp_path: Path, scene: str
-) -> None:
+def test_virtual_machine_answers_during_compilation(tmp_path: Path, scene: str) -> None:
     early, lines = run(tmp_path, "background", scene)
     assert lines.startswith("kuka_lwr_barrett: ")
     assert "background (about 6 s" in lines
@@ -82,7 +80,7 @@ def test_the_virtual_machine_answers_until_there_is_compiled_code(
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/environ").exists(), reason="how processes are found")
-def test_a_compilation_in_the_background_may_be_killed(tmp_path: Path) -> None:
+def test_background_compilation_may_be_killed(tmp_path: Path) -> None:
     early, _ = run(tmp_path, "background")
     for number in workers(tmp_path):
         os.killpg(number, signal.SIGKILL)
@@ -93,7 +91,7 @@ def test_a_compilation_in_the_background_may_be_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_the_first_round_does_not_solve_waits(
+def test_harder_targets_wait_for_the_compiler(
     robot: ik.ArmHand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So nobody's answer depends on when it was asked for."""
@@ -110,7 +108,9 @@ def test_what_the_first_round_does_not_solve_waits(
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_compiler() is None, reason="needs a C compiler")
-def test_nothing_is_compiled_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_compiled_after_preparation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
 
     def through_all_uses() -> list[str]:

@@ -24,7 +24,7 @@ def solver_of(name: str) -> ik.Solver:
 
 
 @pytest.mark.parametrize("name", GRIPPERS)
-def test_a_palm_is_where_it_was_asked_for_though_its_contacts_leave_it_free(name):
+def test_palm_is_kept_where_contacts_leave_it_free(name):
     robot, solver = robot_of(name), solver_of(name)
     q = robot.random(np.random.default_rng(3), 60)
     hand = {robot.actuators[i]: q[:, i] for i in robot.description.hand_actuators}
@@ -37,7 +37,7 @@ def test_a_palm_is_where_it_was_asked_for_though_its_contacts_leave_it_free(name
     assert solver.choose([palm_grasp], limit=2).answered == 1
 
 
-def test_a_palm_out_of_reach_is_diagnosed_as_one():
+def test_unreachable_palm_is_diagnosed():
     robot, solver = robot_of("panda+panda_hand"), solver_of("panda+panda_hand")
     far_palm = robot.palm(robot.home)
     far_palm[0, 3] += 2.0
@@ -51,7 +51,7 @@ def test_a_palm_out_of_reach_is_diagnosed_as_one():
     ("name", "fingers", "count"),
     [("ur5e+robotiq_2f85", 2, 160), ("jaco2+panda_hand", 2, 480), ("puma560+jaco_3f", 1, 220)],
 )
-def test_what_contacts_leave_free_is_searched(name, fingers, count):
+def test_free_palm_components_are_searched(name, fingers, count):
     """Of these reachable targets 1, 5 and 6 were missed."""
     robot, solver = robot_of(name), solver_of(name)
     points, normals = robot.contacts(robot.random(np.random.default_rng(11), count))
@@ -66,7 +66,7 @@ def test_what_contacts_leave_free_is_searched(name, fingers, count):
 
 
 @pytest.mark.parametrize("name", GRIPPERS)
-def test_what_a_hand_of_one_motor_misses_is_diagnosed(name):
+def test_missed_target_of_single_motor_hand_is_diagnosed(name):
     robot, solver = robot_of(name), solver_of(name)
     rng = np.random.default_rng(0)
     points, normals = robot.contacts(robot.random(rng, 20))
@@ -80,7 +80,7 @@ def test_what_a_hand_of_one_motor_misses_is_diagnosed(name):
 
 
 @pytest.mark.slow
-def test_an_arm_with_a_tool():
+def test_arm_with_a_tool():
     robot, solver = robot_of("panda+tool"), solver_of("panda+tool")
     q = robot.random(np.random.default_rng(0), 100)
     points, normals = robot.contacts(q)
@@ -97,7 +97,7 @@ def test_an_arm_with_a_tool():
     assert [diagnosis is None for diagnosis in batch.diagnoses] == batch.success.tolist()
 
 
-def test_a_chain_that_is_one_finger(tmp_path: Path) -> None:
+def test_chain_as_one_finger(tmp_path: Path) -> None:
     """A robot's file of a single chain is taken for a hand of one finger on a base."""
     file = tmp_path / "chain.urdf"
     file.write_text(ik.load_robot("puma560").urdf())

@@ -47,7 +47,9 @@ SCRIPT = """
         pytest.param("original-dls", 40_000, False, True, marks=pytest.mark.slow),
     ],
 )
-def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -> None:
+def test_threads_stop_at_an_interrupt(
+    method: str, count: int, diagnose: bool, compiled: bool
+) -> None:
     """Each whole batch takes minutes even on an idle machine; a busy one gets some patience."""
     script = SCRIPT.format(
         method=method, count=count, diagnose=diagnose, compiled=compiled, noise=int(diagnose)
@@ -61,7 +63,7 @@ def test_threads_stop(method: str, count: int, diagnose: bool, compiled: bool) -
 
 
 @POSIX
-def test_a_stream_has_handed_over_what_is_finished(robot) -> None:
+def test_stream_delivers_finished_blocks(robot) -> None:
     points, normals = robot.contacts(robot.random(np.random.default_rng(0), 30))
     solver = ik.Solver(robot)
     handler_before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -83,7 +85,7 @@ def test_a_stream_has_handed_over_what_is_finished(robot) -> None:
     assert all(block.solution.success.all() for block in finished_blocks)
 
 
-def test_an_error_stops_the_others() -> None:
+def test_error_stops_other_threads() -> None:
     started, stopped = threading.Event(), threading.Event()
 
     def until_told() -> None:

@@ -29,7 +29,7 @@ def path(robot, rng, steps):
     return start + np.arange(steps)[:, None] * direction * 0.25e-3 / speed
 
 
-def test_along_paths_of_small_steps_nothing_jumps(robot, rng):
+def test_small_path_steps_cause_no_jump(robot, rng):
     """It was up to 208 degrees."""
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
     for _ in range(4):
@@ -43,7 +43,7 @@ def test_along_paths_of_small_steps_nothing_jumps(robot, rng):
             q = batch.q[0]
 
 
-def test_every_target_is_solved_from_anywhere_and_nearer_than_without_preference(robot, rng):
+def test_preference_for_q0_is_nearer_and_solves_all(robot, rng):
     q, q0 = robot.random(rng, 300), robot.random(rng, 300)
     solver, targets = ik.Solver(robot, tolerance=EXACT, compiled=False), robot.contacts(q)
     near_batch = solver.solve_batch(*targets, q0=q0)
@@ -55,7 +55,7 @@ def test_every_target_is_solved_from_anywhere_and_nearer_than_without_preference
     np.testing.assert_array_equal(limits_batch.q, solver.solve_batch(*targets).q)
 
 
-def test_nearest_of_those_that_are_seen(robot, rng):
+def test_nearest_known_solution_is_chosen(robot, rng):
     q, q0 = robot.random(rng, 12), robot.random(rng, 12)
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
     batch = solver.solve_batch(*robot.contacts(q), q0=q0)
@@ -67,7 +67,7 @@ def test_nearest_of_those_that_are_seen(robot, rng):
     assert np.median(ratio) < 1.01
 
 
-def test_manipulability(robot, rng):
+def test_manipulability_preference(robot, rng):
     q = robot.random(rng, 3)
     solver = ik.Solver(robot, compiled=False)
     targets = robot.contacts(q)
@@ -80,7 +80,7 @@ def test_manipulability(robot, rng):
     ).all()
 
 
-def test_what_cannot_be_preferred(robot):
+def test_invalid_preferences_are_refused(robot):
     q = robot.home
     with pytest.raises(errors.InputError, match=r"prefer:.*'near'"):
         ik.Solver(robot, compiled=False).solve(grasp_at(robot, q), prefer="near")

@@ -55,7 +55,7 @@ random_targets = given(
 @pytest.mark.slow
 @few_examples
 @random_targets
-def test_solved_is_the_same_whatever_is_preferred(seed, robot, scene):
+def test_success_is_independent_of_preference(seed, robot, scene):
     solver, rng = solver_of(robot, scene), np.random.default_rng(seed)
     points, normals, truth = targets(solver, rng)
     all_starts = starts(solver.robot, rng)
@@ -82,7 +82,7 @@ def test_solved_is_the_same_whatever_is_preferred(seed, robot, scene):
 @pytest.mark.slow
 @few_examples
 @random_targets
-def test_choose_answers_as_many_candidates(seed, robot, scene):
+def test_choose_answers_every_solvable_candidate(seed, robot, scene):
     solver, rng = solver_of(robot, scene), np.random.default_rng(seed)
     points, normals, _ = targets(solver, rng)
     grasps = grasps_of(solver.robot, points, normals)
@@ -97,7 +97,7 @@ def test_choose_answers_as_many_candidates(seed, robot, scene):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_what_cannot_be_reached_near_q0_is_looked_for_elsewhere(robot):
+def test_targets_unreachable_near_q0_are_searched_elsewhere(robot):
     """Near what the tolerances allow other starts end elsewhere: some of these were lost."""
     solver, rng = solver_of(robot, "none"), np.random.default_rng(7)
     points, normals = solver.robot.contacts(solver.robot.random(rng, 400))
@@ -118,7 +118,7 @@ def test_what_cannot_be_reached_near_q0_is_looked_for_elsewhere(robot):
 @pytest.mark.slow
 @pytest.mark.parametrize("grasp", ["shadow_cup", "leap_mustard_bottle"])
 @pytest.mark.parametrize("prefer", ["q0", "limits", "manipulability", "clearance"])
-def test_a_shipped_grasp_on_the_table(grasp, prefer):
+def test_shipped_grasp_on_a_table(grasp, prefer):
     """With "q0" it was COLLISION: one hand was looked at, again and again."""
     shipped_grasp = ik.load_grasp(grasp)
     solution = solver_of(shipped_grasp.robot, "table").solve(shipped_grasp, prefer=prefer)

@@ -58,7 +58,7 @@ def prover(robot: ik.ArmHand) -> Prover:
 
 @pytest.mark.parametrize("tolerance", [1e-12, 1e-6, 5e-3, 2e-2])
 @pytest.mark.parametrize("limits", [True, False])
-def test_no_proof_of_what_can_be_reached(
+def test_reachable_targets_are_not_disproved(
     any_robot: ik.ArmHand, tolerance: float, limits: bool
 ) -> None:
     rng = np.random.default_rng(1)
@@ -82,7 +82,7 @@ def test_no_proof_of_what_can_be_reached(
     part=st.floats(0, 0.99),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_no_proof_within_tolerance(
+def test_targets_within_tolerance_are_not_disproved(
     robot: ik.ArmHand, prover: Prover, place: list[float], part: float, seed: int
 ) -> None:
     q = robot.lower + np.array(place) * (robot.upper - robot.lower)
@@ -93,21 +93,21 @@ def test_no_proof_within_tolerance(
     )
 
 
-def test_a_wrong_hand_is_lost(robot: ik.ArmHand, prover: Prover) -> None:
+def test_wrong_hand_is_refuted(robot: ik.ArmHand, prover: Prover) -> None:
     """What is looked for is found: boxes that hold another hand are refuted."""
     q = robot.random(np.random.default_rng(8), 40)
     problems = batch_of_targets(robot.contacts(q), 5e-3, np.deg2rad(3), True)
     assert wrongly(robot, prover, q[::-1], problems) >= 38
 
 
-def test_the_whole_search_finds_no_proof_either(robot: ik.ArmHand, prover: Prover) -> None:
+def test_full_search_disproves_no_reachable_target(robot: ik.ArmHand, prover: Prover) -> None:
     q = robot.random(np.random.default_rng(9), 4)
     assert (
         prover.prove(batch_of_targets(robot.contacts(q), 5e-3, np.deg2rad(3), True)) == [None] * 4
     )
 
 
-def test_ignored_limits_and_tiny_tolerances_are_never_unreachable(robot: ik.ArmHand) -> None:
+def test_ignored_limits_and_tiny_tolerances_give_no_proof(robot: ik.ArmHand) -> None:
     rng = np.random.default_rng(4)
     q = rng.uniform(-np.pi, np.pi, (40, len(robot.actuators)))
     free = ik.Solver(robot, limits="ignore")
@@ -158,7 +158,7 @@ def test_coupled_mechanisms_and_other_arms(tmp_path: Path, make_robot) -> None:
     coefficients=st.lists(st.floats(-9, 9), min_size=2, max_size=6),
     ends=st.lists(st.floats(-4, 4), min_size=2, max_size=2),
 )
-def test_bounds_of_polynomials_hold(coefficients: list[float], ends: list[float]) -> None:
+def test_polynomial_bounds_hold(coefficients: list[float], ends: list[float]) -> None:
     """Both arithmetics, and as sharply as the interval is short."""
     low, high = sorted(ends)
     value = COUPLING_ROWS[Polynomial].bounds(
@@ -186,7 +186,7 @@ def impossible(robot: ik.ArmHand) -> dict[str, tuple[Array, Array]]:
     }
 
 
-def test_proofs_can_be_checked(robot: ik.ArmHand, prover: Prover) -> None:
+def test_proofs_can_be_verified(robot: ik.ArmHand, prover: Prover) -> None:
     kinds = set()
     for targets in impossible(robot).values():
         problems = batch_of_targets(targets, 5e-3, np.deg2rad(3), True)
@@ -199,7 +199,7 @@ def test_proofs_can_be_checked(robot: ik.ArmHand, prover: Prover) -> None:
     assert kinds == {ProofKind.HAND, ProofKind.REACH}
 
 
-def test_a_finger_of_a_fixed_hand() -> None:
+def test_finger_of_a_fixed_hand() -> None:
     robot = ik.load_robot("ar10")
     points, normals = robot.contacts(robot.home)
     points[2] += [0, 0.05, 0.05]
@@ -211,7 +211,7 @@ def test_a_finger_of_a_fixed_hand() -> None:
     assert proof.check(robot)
 
 
-def test_a_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
+def test_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
     """Even one that was sealed anew after what was changed in it."""
     targets = impossible(robot)
     separation, shoulder = (
@@ -233,7 +233,7 @@ def test_a_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
     assert not replace(shoulder, kind=ProofKind.HAND).sealed().check(robot)
 
 
-def test_every_number_of_a_proof_counts(robot: ik.ArmHand, prover: Prover) -> None:
+def test_every_number_of_a_proof_matters(robot: ik.ArmHand, prover: Prover) -> None:
     points, normals = robot.contacts(robot.random(np.random.default_rng(10), 20))
     normals[:, 0] *= -1
     proofs = prover.prove(batch_of_targets((points, normals), 5e-3, np.deg2rad(3), True))
@@ -243,7 +243,7 @@ def test_every_number_of_a_proof_counts(robot: ik.ArmHand, prover: Prover) -> No
     assert not replace(proof, seal="").check(robot)
 
 
-def test_the_shoulder_as_the_palm_sees_it(robot: ik.ArmHand, prover: Prover) -> None:
+def test_shoulder_in_the_palm_frame(robot: ik.ArmHand, prover: Prover) -> None:
     """Nearer than the elbow bends: half a million boxes did not show it, now some hundred do."""
     points = [[0.077, 0.033, 0.422], [-0.098, -0.059, 0.317], [-0.037, 0.008, 0.542]]
     normals = np.array([[-0.849, -0.424, 0.316], [0.462, -0.108, 0.88], [0.013, 0.06, -0.998]])
@@ -256,7 +256,7 @@ def test_the_shoulder_as_the_palm_sees_it(robot: ik.ArmHand, prover: Prover) -> 
     assert proof.check(robot)
 
 
-def test_bounds_of_a_box_hold_for_what_is_in_it(robot: ik.ArmHand, prover: Prover) -> None:
+def test_box_bounds_hold_inside_the_box(robot: ik.ArmHand, prover: Prover) -> None:
     """Rows of pairs of contacts and the distance of shoulder and wrist; some of them nearly so."""
     rng = np.random.default_rng(3)
     bounds, closest = _bounds(prover), 0.0
@@ -318,7 +318,7 @@ def test_limits_of_shoulder_and_wrist_are_part_of_the_reach(
     np.testing.assert_allclose(cones.cosines(problems), np.cos(np.deg2rad(120)), atol=1e-6)
 
 
-def test_what_is_not_proved_is_not_unreachable(
+def test_unproved_targets_are_not_unreachable(
     robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The best answer, the starts tried and the likely reason, marked as such."""
@@ -339,9 +339,7 @@ def test_what_is_not_proved_is_not_unreachable(
     assert any(line.startswith("not proved; no solution from") for line in diagnosis.lines)
 
 
-def test_what_is_missed_by_little_gets_few_boxes(
-    robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_near_misses_use_few_boxes(robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing excludes it before boxes are small; it took a quarter of a second each time."""
     solver, boxes = ik.Solver(robot), []
     prove = solver._engine.diagnostician._prover.prove
@@ -360,7 +358,7 @@ def test_what_is_missed_by_little_gets_few_boxes(
     assert min(boxes) < PROVER_EFFORT.max_boxes / 4
 
 
-def test_codes_of_the_log_stay() -> None:
+def test_log_codes_are_stable() -> None:
     assert [status.name for status in sorted(ik.Status)] == [
         *("INVALID", "RUNNING", "SOLVED", "STALLED", "ITERATION_LIMIT", "UNREACHABLE", "NOT_FOUND"),
         *("COLLISION", "NEAREST"),

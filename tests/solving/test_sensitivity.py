@@ -40,7 +40,7 @@ def answer(robot, q, free, known_rows, points, normals, scales):
 
 @pytest.mark.parametrize("name", ["kuka_lwr_barrett", "ar10"])
 @pytest.mark.parametrize("case", ["inside", "at limits", "a finger left out"])
-def test_as_answers_nearby(name, case):
+def test_sensitivity_matches_nearby_answers(name, case):
     robot = ik.load_robot(name)
     solver, rng = ik.Solver(robot), np.random.default_rng(3)
     k, n, f = 4, len(robot.actuators), len(robot.fingers)
@@ -101,7 +101,7 @@ def test_gradients_and_other_kinds(robot):
     assert np.abs(np.einsum("kni,ki->kn", free.points[:, :, 1], across)).max() < 1e-9 * size
 
 
-def test_refused(robot):
+def test_bad_sensitivity_input_is_refused(robot):
     solver, q = ik.Solver(robot), robot.home[None]
     points, normals = robot.contacts(q)
     with pytest.raises(errors.InputError, match="q: found shape"):

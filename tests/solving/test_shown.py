@@ -29,7 +29,7 @@ def answers(name):
 
 
 @pytest.mark.parametrize("name", ["kuka_lwr_barrett", "ur5e+shadow"])
-def test_short(name):
+def test_representations_are_short(name):
     for answer in answers(name):
         text = str(answer)
         assert len(text.split("\n")) <= 25, text
@@ -42,7 +42,7 @@ def test_short(name):
         assert ("data:image/png;base64," in page) == isinstance(answer, WITH_PICTURE)
 
 
-def test_what_is_said(robot):
+def test_representations_contain_the_result(robot):
     _, solved, missed, batch, diagnosis, ranked, best = answers("kuka_lwr_barrett")
     assert "SOLVED  hand-first on kuka_lwr_barrett" in str(solved)
     for name, value in zip(solved.actuators, solved.q, strict=True):
@@ -59,7 +59,7 @@ def test_what_is_said(robot):
     assert "thumb (placed first)" in str(robot)
 
 
-def test_tables_need_no_drawing(robot, monkeypatch):
+def test_tables_need_no_plotting(robot, monkeypatch):
     solution = ik.Solver(robot).solve(ik.load_grasp("cup"))
     monkeypatch.setitem(sys.modules, "casadi_ik.app.pictures.thumbnail", None)
     page = solution._repr_html_()
@@ -94,7 +94,7 @@ print(batch.success.sum(), batch.q.sum())
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_progress_is_shown_on_a_terminal_and_changes_no_answer(jobs):
+def test_progress_on_a_terminal_changes_no_answer(jobs):
     words = [sys.executable, "-c", PROGRAM, str(jobs)]
     piped = subprocess.run(words, capture_output=True, text=True, check=True)
     assert piped.stderr == ""

@@ -42,14 +42,14 @@ def same_as_the_log(solver: ik.Solver, grasp: ik.Grasp, path: Path) -> ik.Soluti
 
 
 @pytest.mark.parametrize("method", STEPPED)
-def test_steps_are_those_of_the_log(robot, method: str, tmp_path) -> None:
+def test_steps_match_the_log(robot, method: str, tmp_path) -> None:
     options = {"max_iterations": 60} if method.startswith("original") else {}
     solver = ik.Solver(robot, method, finger_step="closed-form", options=options)
     same_as_the_log(solver, ik.load_grasp("sugar_box"), tmp_path / "x.mcap")
 
 
 @pytest.mark.parametrize("method", ["hand-first", "thumb-first"])
-def test_steps_go_through_all_rounds(robot, method: str, tmp_path) -> None:
+def test_steps_cover_all_restarts(robot, method: str, tmp_path) -> None:
     """A target out of reach takes every start there is; by hand as well as in the loop."""
     solver = ik.Solver(robot, method)
     points, normals = ik.load_grasp("sugar_box").arrays(robot.fingers)
@@ -61,7 +61,7 @@ def test_steps_go_through_all_rounds(robot, method: str, tmp_path) -> None:
     assert solution.restarts == expected - 1
 
 
-def test_state_and_parameters_are_named_and_cannot_be_spoilt(stepped_solver: ik.Solver) -> None:
+def test_state_and_parameters_are_named_and_read_only(stepped_solver: ik.Solver) -> None:
     grasp = ik.load_grasp("sugar_box")
     robot = stepped_solver.robot
     q0 = robot.home + 0.01
@@ -85,7 +85,7 @@ def test_bad_input_is_refused(stepped_solver: ik.Solver) -> None:
         stepped_solver.stepper(ik.Grasp({"thumb": ik.Contact([0.5, 0, 0.5], [1, 0, 0])}))
 
 
-def test_a_method_that_cannot_be_stepped_says_why(stepped_solver: ik.Solver) -> None:
+def test_unsteppable_methods_say_why(stepped_solver: ik.Solver) -> None:
     ipopt_solver = ik.Solver(stepped_solver.robot, method="ipopt")
     with pytest.raises(errors.UnsupportedError, match="Ipopt"):
         ipopt_solver.stepper(ik.load_grasp("sugar_box"))

@@ -69,7 +69,7 @@ def unsolved(robot: ik.ArmHand, tolerance: ik.Tolerance) -> dict[str, list[int]]
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES, ids=["3 deg", "30 deg"])
-def test_success_depends_on_the_question_alone(robot, tolerance):
+def test_success_depends_on_the_target_only(robot, tolerance):
     """The configuration that a target was made from solves it."""
     failures = {call: rows for call, rows in unsolved(robot, tolerance).items() if rows}
     assert not failures

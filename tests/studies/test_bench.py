@@ -38,7 +38,7 @@ def test_every_part_is_measured(case):
     assert measured.get("missed", 0) == 0
 
 
-def test_two_checkouts_by_turns(tmp_path):
+def test_two_checkouts_alternate(tmp_path):
     arguments = ["--part", "batch", "--robots", "ar10", "--count", "16", "--turns", "2"]
     bench.main([*arguments, "--against", str(ROOT), "--report", str(tmp_path)])
     text = (tmp_path / "report.md").read_text()
@@ -58,7 +58,7 @@ def test_rows_above_a_ratio_are_reported():
 
 
 @pytest.mark.parametrize("name", ["xarm7+ability", "kinova_gen3+inspire_rh56", "ur5e+shadow"])
-def test_peers_see_the_robot_that_we_solve(name):
+def test_peer_robots_match_ours(name):
     """Couplings with offsets and several followers of a motor are in their URDF."""
     robot = ik.load_robot(name)
     contacts = peer_solvers.PinContacts(robot)

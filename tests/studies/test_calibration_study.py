@@ -14,7 +14,7 @@ def coverages(report: str) -> list[float]:
     return [float(row) for row in rows]
 
 
-def test_the_committed_report_is_of_many_hands_and_its_bars_are_true():
+def test_stored_report_covers_many_hands_with_true_bars():
     committed = (STUDIES / "results" / "calibration" / "report.md").read_text()
     assert "--hands 150" in committed
     coverage = coverages(committed)

@@ -10,7 +10,7 @@ import pytest
 from collision_study import search
 
 
-def test_a_check_is_never_free_where_others_see_a_penetration():
+def test_check_is_never_free_where_others_penetrate():
     rows, sentence = collision.check(60, 32, 0)
     assert [row[0] for row in rows] == ["random", "free"]
     assert "1 um: **0**" in sentence

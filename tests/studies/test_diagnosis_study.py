@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("usual_flags")
 STUDIES = Path(__file__).parents[2] / "studies"
 
 
-def test_the_study_agrees_with_itself_and_the_committed_report_has_no_false_alarm(tmp_path):
+def test_study_is_consistent_and_stored_report_has_no_false_alarm(tmp_path):
     stored_part = tmp_path / "kept.npz"
     small = [STUDIES / "diagnosis.py", "--impossible", "3"]
     for options in (

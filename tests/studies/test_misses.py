@@ -30,7 +30,7 @@ def test_singular_arms_are_nearer_to_singular(robot, rng):
     assert np.median(palm_slopes(robot, singular_arms(robot, rng, 200))) < np.median(usual) / 4
 
 
-def test_a_count_goes_on_and_lists_what_is_lost(tmp_path):
+def test_count_resumes_and_lists_misses(tmp_path):
     arguments = [*ONE_CASE, "--sampler", "random", "--block", "40", "--out", str(tmp_path)]
     misses.main([*arguments, "--count", "40"])
     (first,) = (tmp_path / "kuka_lwr_barrett").rglob("*.json")
@@ -46,7 +46,7 @@ def test_a_count_goes_on_and_lists_what_is_lost(tmp_path):
     assert "| kuka_lwr_barrett | 5 mm, 3 deg | 1 | 1 |" in text, "it can be solved"
 
 
-def test_a_search_goes_on_and_climbs(tmp_path):
+def test_search_resumes_and_climbs(tmp_path):
     states = []
     for minutes in ("0.02", "0.04"):
         arguments = [*ONE_CASE, "--sampler", "climb", "--minutes", minutes, "--out", str(tmp_path)]

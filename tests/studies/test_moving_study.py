@@ -8,7 +8,7 @@ import moving
 import pytest
 
 
-def test_a_path_that_is_stored_is_not_computed_again(tmp_path, monkeypatch: pytest.MonkeyPatch):
+def test_stored_path_is_not_recomputed(tmp_path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(moving, "STEPS", 200)
     monkeypatch.setattr(moving, "WAIT", 50)
     folder, report = tmp_path / "done", tmp_path / "report"

@@ -8,7 +8,7 @@ import one_body
 import casadi_ik as ik
 
 
-def test_a_random_search_finds_what_is_there_and_nothing_else():
+def test_random_search_finds_exactly_the_solutions():
     robot = ik.load_robot("mobile_kuka_lwr_barrett")
     among, plain = ik.Solver(robot, scene=ik.Scene()), ik.Solver(robot)
     free = one_body.untouched(among, 1, 0)
@@ -17,7 +17,7 @@ def test_a_random_search_finds_what_is_there_and_nothing_else():
     assert not one_body.random_search(among, plain, points[0] + [0, 0, 9.0], normals[0], 0)
 
 
-def test_targets_about_one_keep_its_tolerances():
+def test_perturbed_targets_keep_tolerances():
     robot, tolerance = ik.load_robot("g1+dex3"), ik.Tolerance()
     points, normals = robot.contacts(robot.home)
     moved_points, turned_normals = one_body.around(points, normals, 500, np.random.default_rng(0))

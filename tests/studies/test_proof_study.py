@@ -9,7 +9,7 @@ import numpy as np
 import proofs
 
 
-def test_counts_go_on_and_false_proofs_are_listed(tmp_path, monkeypatch):
+def test_counts_resume_and_false_proofs_are_listed(tmp_path, monkeypatch):
     monkeypatch.setattr(proofs, "BLOCK", 6)
     out, report = tmp_path / "out", tmp_path / "report"
     arguments = ["--robot", "ar10", "--out", str(out), "--report", str(report), "--impossible", "4"]
@@ -30,7 +30,7 @@ def test_counts_go_on_and_false_proofs_are_listed(tmp_path, monkeypatch):
     assert "0.125 0.125" in text
 
 
-def test_every_class_makes_other_contacts(robot):
+def test_every_class_makes_different_contacts(robot):
     contact_sets = []
     for name in impossible_targets.CLASSES:
         points, normals = impossible_targets.impossible(robot, name, np.random.default_rng(1), 5)

@@ -12,7 +12,7 @@ import public_grasps  # noqa: E402
 from make_grasp_sets import made  # noqa: E402
 
 
-def test_what_an_arm_and_a_table_leave_of_published_grasps(tmp_path, monkeypatch):
+def test_published_grasps_on_an_arm_and_a_table(tmp_path, monkeypatch):
     written = made("dexgraspnet_shadow", tmp_path)
     trimesh.creation.box((0.8, 0.8, 1.2)).export(written.path.with_suffix(".obj"))
     monkeypatch.setattr(public_grasps, "SIZES", (0.06,))

@@ -78,7 +78,7 @@ def test_every_choice_can_be_built(tmp_path):
             assert solver not in solvers[:i], keys[i]
 
 
-def test_the_mounting_face_is_another_palm_frame(robot, tmp_path):
+def test_mounting_face_is_another_palm_frame(robot, tmp_path):
     study = ablation_study(tmp_path, 1, 0, 1)
     setting = next(item for item in study.settings if "mounting face" in item.key)
     robot_moved = study.solver(setting).robot

@@ -55,7 +55,7 @@ def test_a_row_per_target_and_setting(done):
     assert not list(done.rglob("*.part"))
 
 
-def test_targets_of_a_block_are_its_own(done):
+def test_block_targets_are_independent(done):
     """Blocks differ, sets differ, and settings share their targets."""
     first, second = STUDY.sets
     q = STUDY.configurations(first, 0)
@@ -114,7 +114,7 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
 
 
 @POSIX
-def test_killed_at_random_moments_nothing_is_lost_or_doubled(done, tmp_path):
+def test_random_kills_lose_and_duplicate_nothing(done, tmp_path):
     """Two workers and their parent are killed again and again until the study is through."""
     rng = random.Random(3)
     kills = 0
@@ -188,7 +188,7 @@ def test_the_logs_of_a_study_are_one_log(tmp_path):
         assert ik.logs.one_solve(log, 0).tolerances[0].position == study.settings[1].tolerance[0]
 
 
-def test_a_log_per_block_keeps_what_is_asked_for(done, tmp_path):
+def test_block_logs_keep_the_selected_solves(done, tmp_path):
     study = dataclasses.replace(STUDY, settings=STUDY.settings[:1])
     run(study, tmp_path, log=ik.logs.Keep(failed=True, singular=False, sample=0.25))
     assert contents(tmp_path, study).equals(contents(done, study))

@@ -27,7 +27,7 @@ def test_every_pose_rests_on_the_table():
     assert sorted(ups) == [0, 1, 2]
 
 
-def test_contacts_that_do_not_oppose_each_other_do_not_close():
+def test_non_opposing_contacts_do_not_close():
     assert touch.closes(ACROSS, -ACROSS / 0.03, 0.03)
     side_normals = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert not touch.closes(ACROSS, side_normals, 0.03)

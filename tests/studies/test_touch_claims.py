@@ -25,7 +25,7 @@ def test_every_claim_holds_on_a_coarse_mesh(tmp_path):
     }
 
 
-def test_the_check_tells_another_mesh():
+def test_check_detects_another_mesh():
     surface, mesh = touch_claims.surface_of("coarse_can")
     solver, pose = touch_claims.solver_of("panda+allegro_right"), standing(surface, 0.7)
     grasp = solver.grasps_of(surface, pose, limit=1, among=1)[0]
@@ -41,7 +41,7 @@ def test_the_check_tells_another_mesh():
     assert violations["outside the cone"]
 
 
-def test_closure_needs_contacts_that_oppose_each_other():
+def test_closure_needs_opposing_contacts():
     across = np.array([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0]])
     assert touch_claims.closure_margin(across, -across / 0.03, 0.03) > 1e-3
     side_normals = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

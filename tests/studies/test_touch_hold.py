@@ -18,7 +18,7 @@ import casadi_ik as ik
 RESULTS = Path(touch_hold.__file__).parent / "results"
 
 
-def test_what_is_squeezed_too_little_falls(monkeypatch):
+def test_weak_squeeze_drops_the_object(monkeypatch):
     solver, surface = ik.Solver(ik.load_robot("panda+panda_hand")), ik.load_surface("tennis_ball")
     (grasp,) = solver.grasps_of(surface, standing(surface, 0.7), limit=1, among=1)
     down = -np.eye(3)[2:]
@@ -37,7 +37,7 @@ def test_the_area_under_the_curve():
 
 
 @pytest.mark.parametrize(("folder", "min_value"), [("touch_hold", 0.88), ("touch_hold_ycb", 0.88)])
-def test_in_the_committed_reports_the_load_predicts(folder, min_value):
+def test_stored_reports_predict_the_load(folder, min_value):
     text = (RESULTS / folder / "metrics.json").read_text()
     values = {entry["name"]: entry["value"] for entry in json.loads(text)}
     areas = [value for name, value in values.items() if name.endswith("/auc")]

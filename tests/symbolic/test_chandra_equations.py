@@ -76,9 +76,7 @@ def test_the_docstring_names_the_equation(number):
 
 @PROPERTY
 @given(rotation_vectors, vectors, unit_vectors, vectors, st.floats(-1, 1))
-def test_eqs_1_2_a_line_is_left_in_place_by_a_screw_about_it(
-    w, distance_along, axis, point, distance
-):
+def test_eqs_1_2_screw_leaves_its_line_invariant(w, distance_along, axis, point, distance):
     angle = float(np.linalg.norm(w))
     line = dq.directed_line(ca.DM(axis), ca.DM(point))
     x = dq.exp_screw(angle, distance, *line)

@@ -79,7 +79,7 @@ def test_no_closed_chain_without_an_arm(coupled_robot):
 
 
 @pytest.mark.parametrize("borrowed", [-1, 7, 8])
-def test_borrowed_joints_are_the_arms(robot, borrowed):
+def test_borrowed_joints_belong_to_the_arm(robot, borrowed):
     with pytest.raises(ik.errors.UnsupportedError, match="borrowed: found"):
         split(robot.description, borrowed)
 
@@ -99,7 +99,7 @@ def test_thumb_keeps_its_contact(chain, robot, rng):
         assert abs(normal @ jacobian[3:] @ motors) > 1e-6
 
 
-def test_virtual_joint_is_the_turn_about_the_normal(chain, robot, rng):
+def test_virtual_joint_rotates_about_the_normal(chain, robot, rng):
     parts, _, evaluate = chain
     at = parts.active.index(VIRTUAL)
     for _, step, values in samples(robot, rng, evaluate, 5):
@@ -186,7 +186,7 @@ def test_mobility_is_computed(derived, rng):
         assert mobility(evaluate(q)[0]) == joints + 2
 
 
-def test_the_palm_moves_as_the_thumb_lets_it(derived, rng):
+def test_palm_moves_as_the_thumb_permits(derived, rng):
     """Rank of the palm's J_cc: virtual joint and thumb, six at most; the elbow adds nothing."""
     joints, robot = derived
     _, evaluate = matrices(robot)
@@ -220,7 +220,7 @@ def test_the_chain_is_the_null_space_of_the_thumbs_rows(derived, rng):
     assert checked > 3
 
 
-def test_rows_two_to_six_of_h_are_the_arms(robot, rng):
+def test_h_rows_two_to_six_belong_to_the_arm(robot, rng):
     """Not h_1 to h_5, as eq. (8) prints: with q_p of eq. (7) the first row is the thumb's."""
     q = ca.SX.sym("q", 14)
     body, parts = actuated(robot.description, q), split(robot.description)
@@ -284,7 +284,7 @@ def cases(robot, rng, problem, count):
         yield q, [np.array(x) for x in linear]
 
 
-def test_unlimited_both_take_the_same_step(robot, problem, steps, rng):
+def test_unlimited_variants_take_the_same_step(robot, problem, steps, rng):
     """The projector's formula is the minimiser under the thumb's equations."""
     unlimited = np.full(14, WIDE)
     for damping in (0.03, 1.0):
@@ -306,7 +306,7 @@ def test_unlimited_both_take_the_same_step(robot, problem, steps, rng):
             assert np.abs(slope).max() < 1e-4 * np.abs(null.T @ rows.T @ other_rows).max() + 1e-9
 
 
-def test_both_keep_to_the_limits(robot, problem, steps, rng):
+def test_both_variants_keep_limits(robot, problem, steps, rng):
     """What is fixed stands at its limit, and the thumb keeps its place as far as it can."""
     fixed, agree, total = 0, 0, 0
     for q, linear in cases(robot, rng, problem, 40):

@@ -195,7 +195,7 @@ def test_random_and_nearly_singular(shape):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 3), (3, 3), (6, 7)])
-def test_zero_and_rank_deficient_are_numbers(shape):
+def test_zero_and_rank_deficient_are_finite(shape):
     extremes = function(*shape)
     assert tuple(map(float, extremes(np.zeros(shape)))) == (0.0, 0.0)
     smallest, largest = map(float, extremes(np.ones(shape)))
@@ -290,7 +290,7 @@ def test_every_step_descends_and_stays_within(step, rng, passes):
     assert ascents <= (5 if passes == 1 else 0)
 
 
-def test_a_held_coordinate_is_let_go_when_the_others_pull_it_inside(step):
+def test_bound_coordinate_is_released_when_pulled_inside(step):
     """Its own slope points outwards, but not once the others have moved."""
     J, r = np.zeros((M, N)), np.zeros(M)
     J[:N, :N] = np.eye(N)
@@ -304,7 +304,7 @@ def test_a_held_coordinate_is_let_go_when_the_others_pull_it_inside(step):
     np.testing.assert_allclose(s, exact(*inputs), atol=1e-6)
 
 
-def test_a_locked_coordinate_does_not_move(step, rng):
+def test_locked_coordinate_does_not_move(step, rng):
     J, r, damping, value, lower, upper = problem(rng, 1.0)
     lower, upper = lower.copy(), upper.copy()
     lower[1] = upper[1] = value[1]
@@ -312,7 +312,7 @@ def test_a_locked_coordinate_does_not_move(step, rng):
     assert s[FIRST + 1] == 0.0
 
 
-def test_a_singular_problem_is_finite(step):
+def test_singular_problem_is_finite(step):
     s, _ = step(np.zeros((M, N)), np.ones(M), 1e-12, np.zeros(4), -np.ones(4), np.ones(4))
     np.testing.assert_array_equal(s, 0)
 
@@ -321,7 +321,7 @@ FINGERS, JOINTS, PALM = 5, 4, 6
 
 
 @pytest.mark.parametrize("full", [0, 3])
-def test_a_sparse_problem_has_the_solution_of_the_dense_one(rng, full):
+def test_sparse_problem_matches_the_dense_one(rng, full):
     """Rows that concern all coordinates aside, fingers share no more than their palm."""
     count = PALM + FINGERS * JOINTS
     J = fingers()

@@ -106,7 +106,7 @@ def test_branch_from_a_known_pose():
         mechanisms.branch_from_pose(Linkage(1.0, 0.1, 3.0, 0.1), 3.0, 0.0)
 
 
-def test_beyond_assembly_everything_stays_finite_and_the_measure_says_so():
+def test_beyond_assembly_values_are_finite_and_flagged():
     gradients = [
         gradient(lambda phi, b, g=g: g(phi, bar(b)), S, B)
         for g in (mechanisms.psi, mechanisms.theta3, mechanisms.theta3_rate)

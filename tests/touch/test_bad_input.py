@@ -86,7 +86,7 @@ def test_surfaces_that_are_not_meshes(solver, source):
 
 
 @pytest.mark.parametrize("name", ["no_such_object", "no_such_file.stl", "", Path("missing.obj")])
-def test_names_of_nothing(solver, name):
+def test_unknown_object_names_are_refused(solver, name):
     with pytest.raises((errors.UnknownNameError, errors.DescriptionError)):
         solver.grasps_of(name, PLACE)
 
@@ -123,7 +123,7 @@ def test_wrong_displacements(solver, options):
         lambda robot, q: q[:, 0] * np.nan,
     ],
 )
-def test_functions_that_do_not_rank(solver, prefer):
+def test_non_ranking_functions_are_refused(solver, prefer):
     with pytest.raises(errors.InputError, match="prefer"):
         solver.grasps_of("tomato_soup_can", PLACE, limit=1, among=1, prefer=prefer)
 

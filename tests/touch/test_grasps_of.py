@@ -66,7 +66,7 @@ def test_every_grasp_is_confirmed_in_the_scene(grasps_found):
         assert list(grasps.counts.values()) == sorted(grasps.counts.values(), reverse=True)
 
 
-def test_what_is_written_is_what_was_found(grasps_found):
+def test_written_grasps_match(grasps_found):
     solver, grasps = grasps_found
     stored = np.load(io.BytesIO(grasps_npz(grasps, solver.robot.fingers)))
     arrays = {name: stored[name] for name in ("points", "normals", "balls") if name in stored}
@@ -76,7 +76,7 @@ def test_what_is_written_is_what_was_found(grasps_found):
     assert np.nanmax(batch.position_error) < 1e-9
 
 
-def test_things_beside_the_object_are_kept_clear_of(surface):
+def test_neighbouring_obstacles_are_avoided(surface):
     """A wall, a post and a cloud of points close by, told apart by their exact distances."""
     cloud = np.stack(np.meshgrid([0.47, 0.5, 0.53], [0.02], [0.03, 0.06, 0.09]), -1).reshape(-1, 3)
     scene = ik.Scene(
@@ -125,7 +125,7 @@ def test_fingertips_touch_the_mesh(grasps_found):
 
 
 @pytest.mark.slow
-def test_no_pad_hovers_beyond_an_edge():
+def test_no_pad_extends_beyond_an_edge():
     """By distances of balls to an exact box, lying so that its long edges are at hand."""
     solver, pose = solver_of("panda+leap"), np.eye(4)
     pose[:3, :3] = [[0.5, 0, 0.5 * 3**0.5], [0.5 * 3**0.5, 0, -0.5], [0, 1, 0]]
@@ -147,7 +147,7 @@ def test_no_pad_hovers_beyond_an_edge():
             assert distance == pytest.approx(radius, abs=1.1e-3)
 
 
-def test_loads_are_those_of_linear_programs(grasps_found):
+def test_loads_match_linear_programs(grasps_found):
     """With the same soft fingers, on the exact cylinder: close, since normals are sampled."""
     grasp = grasps_found[1][0]
     points = np.array([c.point for c in grasp.grasp.contacts.values()]) - PLACE[:3, 3]
@@ -190,7 +190,7 @@ LINE = np.array([[[-0.03, 0, 0], [0.03, 0, 0], [0.01, 0, 0]]])
         pytest.param(LINE[:, [0, 1, 0]], -LINE[:, [0, 1, 0]], 1e-9, id="one of them twice"),
     ],
 )
-def test_loads_of_any_contacts_are_those_of_linear_programs(points, normals, off, rng):
+def test_loads_of_any_contacts_match_linear_programs(points, normals, off, rng):
     """What nothing holds is 0; HiGHS is not surer than `off` where contacts nearly depend."""
     for count in (2, 3, 5) if points is None else (3,):
         at = 0.03 * rng.normal(size=(6, count, 3)) if points is None else points
@@ -217,7 +217,7 @@ EXACTLY = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 
 
 
 @pytest.mark.parametrize("radius", [0.0, 0.012])
-def test_squeezed_between_two_balls_an_object_turns_the_easier_the_harder_it_is_pressed(radius):
+def test_rotational_stiffness_falls_with_squeeze_force(radius):
     """Two springs on a line: 2 k R^2 against turning, less 2 F (R - radius)."""
     k, half_width, force = 400.0, 0.04, 6.0
     normals = np.array([[[1.0, 0, 0], [-1.0, 0, 0]]])
@@ -257,7 +257,7 @@ def test_grasps_differ_and_are_ranked(grasps_found):
 
 
 @pytest.mark.slow
-def test_a_gripper_comes_from_any_side_about_the_line_between_its_pads(surface):
+def test_gripper_approaches_from_any_side(surface):
     solver = solver_of("panda+panda_hand")
     sectors = set()
     for grasp in solver.grasps_of(surface, PLACE, limit=60, among=60):
@@ -274,7 +274,7 @@ def test_a_gripper_comes_from_any_side_about_the_line_between_its_pads(surface):
     assert len(sectors) >= 8
 
 
-def test_open_before_and_squeezing_after(grasps_found):
+def test_pregrasp_opens_and_squeeze_closes(grasps_found):
     solver, grasps = grasps_found
     opened = [grasp for grasp in grasps if grasp.pregrasp is not None]
     assert opened
@@ -285,7 +285,7 @@ def test_open_before_and_squeezing_after(grasps_found):
 
 
 @pytest.mark.slow
-def test_there_is_a_way_to_most_grasps_and_up_from_there(grasps_found):
+def test_most_grasps_have_an_approach_and_a_lift(grasps_found):
     solver, grasps = grasps_found
     motions = [solver.approach(grasp) for grasp in grasps]
     assert sum(reach_motion.success for reach_motion in motions) >= 0.75 * len(motions)
@@ -302,7 +302,7 @@ def test_there_is_a_way_to_most_grasps_and_up_from_there(grasps_found):
 
 
 @pytest.mark.slow
-def test_what_is_lifted_is_placed_elsewhere(grasps_found):
+def test_lifted_object_is_placed_elsewhere(grasps_found):
     solver, grasps = grasps_found
     robot, to = solver.robot, PLACE.copy()
     to[:3, 3] = [0.45, -0.15, 0.055]
@@ -330,7 +330,7 @@ def test_what_is_lifted_is_placed_elsewhere(grasps_found):
     assert np.linalg.norm(tips, axis=1).min() > 0.05
 
 
-def test_forces_leave_the_object_at_rest_within_friction(grasps_found):
+def test_forces_balance_within_friction(grasps_found):
     grasps = grasps_found[1]
     for grasp in grasps:
         contacts = grasp.grasp.contacts
@@ -351,7 +351,7 @@ def test_forces_leave_the_object_at_rest_within_friction(grasps_found):
         assert (slid <= grasps.mu * pressed + 0.03).all()  # normals of samples are of flat facets
 
 
-def test_motors_squeeze_as_equal_springs_do(grasps_found):
+def test_squeeze_matches_equal_springs(grasps_found):
     """A squeeze moves motors in proportion to the torques of the forces, by virtual work."""
     grasps = grasps_found[1]
     robot = grasps_found[0].robot
@@ -384,12 +384,12 @@ def test_motors_squeeze_as_equal_springs_do(grasps_found):
         )
 
 
-def test_what_is_where_it_should_be_is_closed_on(grasps_found):
+def test_nominal_pose_is_closed_on(grasps_found):
     grasps = grasps_found[1]
     np.testing.assert_array_equal(grasps.robustness(position=0.0, angle=0.0, samples=1), 1.0)
 
 
-def test_the_farther_off_the_fewer(grasps_found):
+def test_robustness_falls_with_noise(grasps_found):
     grasps = grasps_found[1]
     small_noise, large_noise, huge_noise = (
         grasps.robustness(position=position, samples=24).mean() for position in (0.005, 0.02, 0.2)
@@ -407,7 +407,7 @@ def test_bad_noise_is_refused(grasps_found):
         grasps.robustness(position=-1)
 
 
-def test_seeds_decide_and_jobs_do_not(grasps_found, surface):
+def test_seeds_matter_and_jobs_do_not(grasps_found, surface):
     solver, grasps = grasps_found
     parallel_grasps = solver.grasps_of(surface, PLACE, limit=12, among=12, seed=1, jobs=2)
     assert all(np.array_equal(a.q, b.q) for a, b in zip(grasps, parallel_grasps, strict=True))
@@ -416,14 +416,14 @@ def test_seeds_decide_and_jobs_do_not(grasps_found, surface):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_without_a_compiler_it_is_refused(grasps_found, surface, monkeypatch):
+def test_missing_compiler_is_refused(grasps_found, surface, monkeypatch):
     monkeypatch.setenv("CC", "none")
     with pytest.raises(errors.UnsupportedError, match=r"grasps_of: .*compiler"):
         grasps_found[0].grasps_of(surface, PLACE, limit=12, among=12)
 
 
 @pytest.mark.slow
-def test_what_has_to_be_held_is_held(surface):
+def test_required_load_is_held(surface):
     grasps_found = solver_of("panda+panda_hand").grasps_of(
         surface, PLACE, limit=5, among=5, hold=(0.1, 18.0)
     )
@@ -432,7 +432,7 @@ def test_what_has_to_be_held_is_held(surface):
 
 
 @pytest.mark.slow
-def test_torques_of_motors_limit_the_squeeze(surface):
+def test_motor_torques_limit_the_squeeze(surface):
     """The one that is used most has all that it can, by differences of its fingertips' places."""
     solver = solver_of("panda+leap")
     robot = solver.robot
@@ -454,7 +454,7 @@ def test_torques_of_motors_limit_the_squeeze(surface):
     assert unknown[0].most_squeeze == np.inf
 
 
-def test_the_best_of_many_are_given(grasps_found, surface):
+def test_best_of_many_are_returned(grasps_found, surface):
     solver, few = grasps_found
     all_grasps = solver.grasps_of(surface, PLACE, limit=100, seed=1, among=1)
     best = solver.grasps_of(surface, PLACE, limit=12, seed=1, among=100)
@@ -462,7 +462,7 @@ def test_the_best_of_many_are_given(grasps_found, surface):
     assert np.mean([grasp.load for grasp in best]) > np.mean([grasp.load for grasp in few])
 
 
-def test_a_function_may_rank(surface):
+def test_custom_ranking_function(surface):
     grasps_found = solver_of("panda+panda_hand").grasps_of(
         surface, PLACE, limit=5, among=20, prefer=lambda robot, q: robot.palm(q)[:, 2, 3]
     )
@@ -471,7 +471,7 @@ def test_a_function_may_rank(surface):
     )
 
 
-def test_what_is_too_large_says_so(tmp_path):
+def test_oversized_object_is_reported(tmp_path):
     box = surface_of(tmp_path, trimesh.creation.box((0.5, 0.5, 0.5)))
     grasps_found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(box, PLACE)
     assert not len(grasps_found)
@@ -479,7 +479,7 @@ def test_what_is_too_large_says_so(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_search_ends_when_nothing_new_is_found(tmp_path):
+def test_search_ends_without_new_grasps(tmp_path):
     cube = surface_of(tmp_path, trimesh.creation.box((0.012, 0.012, 0.012)))
     grasps_found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(cube, PLACE)
     assert 0 < len(grasps_found) < 200
@@ -498,12 +498,12 @@ def test_the_search_ends_when_nothing_new_is_found(tmp_path):
         ({"pose": np.zeros((4, 4))}, "pose: the matrix is not a rotation"),
     ],
 )
-def test_bad_questions_are_refused(surface, options, expected):
+def test_bad_queries_are_refused(surface, options, expected):
     with pytest.raises(errors.InputError, match=expected.replace("(", r"\(")):
         solver_of("panda+panda_hand").grasps_of(surface, **{"pose": PLACE, **options})
 
 
-def test_a_mesh_that_is_inside_out_is_turned_and_said(tmp_path, surface):
+def test_inverted_mesh_is_flipped_and_reported(tmp_path, surface):
     mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
     mesh.invert()
     turned_surface = surface_of(tmp_path, mesh)
@@ -515,7 +515,7 @@ def test_a_mesh_that_is_inside_out_is_turned_and_said(tmp_path, surface):
     assert turned_surface.notes[0] in str(grasps_found)
 
 
-def test_an_open_mesh_serves_and_is_said(tmp_path):
+def test_open_mesh_is_accepted_and_reported(tmp_path):
     mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
     mesh.update_faces(mesh.triangles_center[:, 2] < 0.049)
     opened = surface_of(tmp_path, mesh)
@@ -523,7 +523,7 @@ def test_an_open_mesh_serves_and_is_said(tmp_path):
     assert len(solver_of("panda+panda_hand").grasps_of(opened, PLACE, limit=3, among=3)) == 3
 
 
-def test_triangles_that_face_opposite_ways_are_refused(tmp_path):
+def test_inconsistent_triangles_are_refused(tmp_path):
     mesh = trimesh.creation.cylinder(0.033, 0.1, sections=128)
     faces = np.array(mesh.faces)
     faces[::2] = faces[::2, ::-1]
@@ -532,7 +532,7 @@ def test_triangles_that_face_opposite_ways_are_refused(tmp_path):
         surface_of(tmp_path, mixed)
 
 
-def test_sheets_and_specks_are_no_bodies(tmp_path):
+def test_sheets_and_specks_are_refused(tmp_path):
     sheet = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0.1]], [[0, 1, 2]])
     with pytest.raises(errors.InputError, match="found a flat sheet"):
         surface_of(tmp_path, sheet)
@@ -548,7 +548,7 @@ def test_sheets_and_specks_are_no_bodies(tmp_path):
         ("v 0 0 0\nv inf 1 0\nv 0 1 1\nf 1 2 3\n", "a vertex is not finite"),
     ],
 )
-def test_what_is_no_mesh_is_refused(tmp_path, text, expected):
+def test_non_meshes_are_refused(tmp_path, text, expected):
     (tmp_path / "mesh.obj").write_text(text)
     with pytest.raises(errors.DescriptionError, match=expected):
         ik.load_surface(tmp_path / "mesh.obj")
@@ -563,7 +563,7 @@ def test_many_triangles_are_sampled(tmp_path):
     assert np.abs(np.linalg.norm(surface.points, axis=1) - 0.035).max() < 1e-5
 
 
-def test_millimetres_are_told(tmp_path):
+def test_millimetres_are_detected(tmp_path):
     with pytest.raises(errors.InputError, match=r"scale=0\.001"):
         surface_of(tmp_path, trimesh.creation.cylinder(33, 100))
     grasps_found = ik.load_surface(tmp_path / "mesh.stl", scale=0.001)
@@ -577,7 +577,7 @@ def test_millimetres_are_told(tmp_path):
         pytest.param([[-0.02, 0.034, -0.03], [0.02, 0.034, -0.03], [0, 0.034, 0.03]], id="label"),
     ],
 )
-def test_what_stands_off_costs_no_grasps(tmp_path, corners):
+def test_protruding_parts_cost_no_grasps(tmp_path, corners):
     """A speck is no part, a label a thin one."""
     body = trimesh.creation.cylinder(0.033, 0.1, sections=64)
     both = trimesh.util.concatenate([body, trimesh.Trimesh(corners, [[0, 1, 2]])])
@@ -587,7 +587,7 @@ def test_what_stands_off_costs_no_grasps(tmp_path, corners):
     assert len(grasps_found) == 3
 
 
-def test_what_is_out_of_reach_is_given_up(surface):
+def test_unreachable_object_ends_early(surface):
     far_pose = PLACE.copy()
     far_pose[0, 3] = 5.0
     grasps_found = ik.Solver(ik.load_robot("panda+panda_hand")).grasps_of(surface, far_pose)
@@ -598,7 +598,7 @@ def test_what_is_out_of_reach_is_given_up(surface):
 
 
 @pytest.mark.slow
-def test_fingers_lean_on_what_they_envelop(surface, tmp_path):
+def test_enveloping_fingers_support_the_object(surface, tmp_path):
     """Their links alone, and no deeper than the scene says; plain scenes refuse these hands."""
     robot, deep = ik.load_robot("panda+leap"), 0.006
     text = f"enveloping: {deep}\n{ik.load_scene('table').text()}"
@@ -630,7 +630,7 @@ def test_fingers_lean_on_what_they_envelop(surface, tmp_path):
     assert max(depths) > 0.5 * deep
 
 
-def test_a_file_that_is_another_mesh_by_now(tmp_path):
+def test_changed_mesh_file_is_detected(tmp_path):
     solver, path = solver_of("panda+panda_hand"), tmp_path / "part.stl"
     for part in (trimesh.creation.icosphere(3, 0.03), trimesh.creation.box((0.05, 0.09, 0.11))):
         part.export(path)

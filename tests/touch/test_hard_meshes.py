@@ -51,7 +51,7 @@ def test_double_sided_meshes_are_used_once(tmp_path, solver, order):
     assert len(solver.grasps_of(surface, PLACE, limit=5, among=5)) == 5
 
 
-def test_bodies_that_touch_are_not_double_sided(tmp_path):
+def test_touching_bodies_are_not_double_sided(tmp_path):
     boxes = [trimesh.creation.box((0.04, 0.04, 0.04)) for _ in range(2)]
     boxes[1].apply_translation([0.04, 0, 0])
     surface = ik.load_surface(saved(tmp_path, trimesh.util.concatenate(boxes)))
@@ -99,7 +99,7 @@ def test_many_pieces_are_answered(tmp_path, solver):
 
 
 @pytest.mark.slow
-def test_the_hint_for_too_many_pieces_suffices(tmp_path, monkeypatch):
+def test_hint_for_too_many_pieces_suffices(tmp_path, monkeypatch):
     pieces = []
     for place in np.ndindex(12, 12, 8):
         piece = trimesh.creation.box((2e-3,) * 3)
@@ -114,7 +114,7 @@ def test_the_hint_for_too_many_pieces_suffices(tmp_path, monkeypatch):
     assert len(ik.load_surface(path).points)
 
 
-def test_huge_triangles_beside_a_speck_are_answered(tmp_path, solver):
+def test_huge_triangles_beside_a_speck(tmp_path, solver):
     speck = trimesh.creation.icosphere(2, 0.003)
     wall = trimesh.Trimesh(
         [[0.01, 0, 0], [1.5, 0.3, 0], [0.02, 1.5, 0.1], [0.02, 1.5, -0.1]], [[0, 1, 2], [0, 2, 3]]

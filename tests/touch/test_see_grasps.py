@@ -28,7 +28,7 @@ def grasps(solver):
 
 
 @pytest.mark.opengl
-def test_a_picture_has_a_panel_for_each_of_the_best(solver, grasps, tmp_path):
+def test_picture_has_a_panel_per_grasp(solver, grasps, tmp_path):
     path = tmp_path / "best.png"
     figure = views.draw_grasps(solver.robot, grasps, path, scene=solver.scene, most=4)
     assert len(figure.axes) == 4
@@ -40,13 +40,13 @@ def test_a_picture_has_a_panel_for_each_of_the_best(solver, grasps, tmp_path):
     assert image.std() > 10
 
 
-def test_nothing_is_no_picture(solver):
+def test_empty_picture_is_refused(solver):
     with pytest.raises(ik.errors.InputError, match="found:"):
         views.draw_grasps(solver.robot, [])
 
 
 @pytest.mark.opengl
-def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys, view):
+def test_command_writes_picture_and_page(tmp_path, capsys, view):
     out, picture = tmp_path / "found.npz", tmp_path / "best.png"
     words = [*GRASP_COMMAND, "--object-pose", *PLACE, "--out", str(out), "--picture", str(picture)]
     assert main(words) == 0
@@ -65,7 +65,7 @@ def test_a_command_from_an_object_to_a_picture_and_a_page(tmp_path, capsys, view
     np.testing.assert_allclose(page.result.q, np.load(out)["q"][1], atol=1e-3)
 
 
-def test_none_found_says_why_and_writes_nothing(tmp_path, capsys):
+def test_failed_search_writes_nothing(tmp_path, capsys):
     out = tmp_path / "found.npz"
     far_pose = ("5", "0", "0.051", "0", "0", "0")
     assert main([*GRASP_COMMAND, "--object-pose", *far_pose, "--out", str(out)]) == 1

@@ -121,9 +121,7 @@ def arrived(file: Path) -> None:
     assert file.is_file(), sorted(path.name for path in file.parent.iterdir())
 
 
-def test_object_and_contact_are_dragged_by_mouse_and_reached(
-    cup: viewing.Viewer, browser: Browser
-) -> None:
+def test_dragged_object_and_contact_are_reached(cup: viewing.Viewer, browser: Browser) -> None:
     page, client = opened(browser, cup)
     time.sleep(1.5)  # the camera comes to rest
     assert text_of(page, ".ik-status") == "SOLVED"
@@ -160,9 +158,7 @@ def test_object_and_contact_are_dragged_by_mouse_and_reached(
     page.close()
 
 
-def test_two_browsers_see_one_drag_and_save_it(
-    cup: viewing.Viewer, browser: Browser, tmp_path: Path
-) -> None:
+def test_two_browsers_share_one_drag(cup: viewing.Viewer, browser: Browser, tmp_path: Path) -> None:
     second_page, _ = opened(browser, cup)
     page, _ = opened(browser, cup, painted=True)
     view = cup.page

@@ -31,7 +31,7 @@ def test_a_grasp_and_a_robot(view) -> None:
     assert cup.url != robot.url
 
 
-def test_a_body_by_its_name_is_moved_part_by_part(view) -> None:
+def test_body_is_moved_part_by_part(view) -> None:
     page = view("mobile_kuka_lwr_barrett").page
     robot = page.robot
     q = robot.home + 0.3 * (np.arange(len(robot.home)) == robot.actuators.index("base_yaw"))
@@ -82,7 +82,7 @@ RANKED = (
         ("\xff", "casadi-ik choose"),
     ],
 )
-def test_ranked_files_that_are_none(
+def test_bad_ranked_files_are_refused(
     text: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "ranked.json"
@@ -93,7 +93,7 @@ def test_ranked_files_that_are_none(
     assert error_text.count("\n") == 1
 
 
-def test_logs_play_side_by_side(view, robot: ik.ArmHand, tmp_path: Path) -> None:
+def test_logs_play_concurrently(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
     for path, grasp in zip(paths, ("cup", "mug"), strict=True):
         ik.Solver(robot).solve(ik.load_grasp(grasp), log=path)
@@ -136,7 +136,7 @@ def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
         (["cup", "--port", "99999"], "--port: .*'99999'"),
     ],
 )
-def test_bad_words_are_one_line(
+def test_bad_options_are_refused(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["view", *words]) == 2
@@ -145,7 +145,7 @@ def test_bad_words_are_one_line(
     assert error_text.count("\n") == 1
 
 
-def test_a_robot_and_a_solution_show_themselves(robot: ik.ArmHand) -> None:
+def test_robot_and_solution_open_viewers(robot: ik.ArmHand) -> None:
     opened_viewer = robot.view()
     assert opened_viewer.page.result.success
     opened_viewer.stop()
@@ -156,9 +156,7 @@ def test_a_robot_and_a_solution_show_themselves(robot: ik.ArmHand) -> None:
     viewer.stop()
 
 
-def test_without_viser_the_extra_is_named(
-    robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_viser_names_the_extra(robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch) -> None:
     import sys
 
     for name in [name for name in sys.modules if name.startswith("casadi_ik.app.viewer")]:

@@ -12,7 +12,7 @@ from casadi_ik import errors
 from casadi_ik.app import viewer as viewing
 
 
-def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description: Path) -> None:
+def test_dragged_pads_round_trip(pads: viewing.Viewer, description: Path) -> None:
     page = pads.page
     robot_before = ik.load_robot(description)
     points, normals = robot_before.contacts(robot_before.home)
@@ -37,7 +37,7 @@ def test_dragged_pads_are_saved_and_read_back(pads: viewing.Viewer, description:
     assert page.changed_fingers == []
 
 
-def test_a_pad_goes_onto_the_skin(pads: viewing.Viewer) -> None:
+def test_pad_snaps_to_the_skin(pads: viewing.Viewer) -> None:
     page = pads.page
     page.snap_to_surface("first")
     assert page.work.settle(300)
@@ -55,7 +55,7 @@ def test_a_pad_goes_onto_the_skin(pads: viewing.Viewer) -> None:
     assert page.changed_fingers == []
 
 
-def test_pads_that_are_not_stated_are_asked_for(tmp_path: Path) -> None:
+def test_unstated_pads_are_refused(tmp_path: Path) -> None:
     other_file = tmp_path / "other.yaml"
     other_file.write_text("name: other\nhand: barrett_bh8_280\nfingers: [thumb]\n")
     with pytest.raises(errors.DescriptionError, match=r"other\.yaml: fingers: expected"):

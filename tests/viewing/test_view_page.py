@@ -23,7 +23,7 @@ def shifted(pose: np.ndarray, *by: float) -> np.ndarray:
     return moved_pose
 
 
-def test_the_page_begins_solved_and_serves_this_machine_only(cup: viewing.Viewer) -> None:
+def test_page_starts_solved_and_local(cup: viewing.Viewer) -> None:
     page = cup.page
     assert page.result.success
     assert page.result.clearance is not None
@@ -53,7 +53,7 @@ def test_a_dragged_contact_and_normal_are_reached(cup: viewing.Viewer) -> None:
     assert np.abs(page.result.q - q_before).max() < 0.5
 
 
-def test_links_stand_where_they_hang(cup: viewing.Viewer, rng: np.random.Generator) -> None:
+def test_links_match_the_kinematics(cup: viewing.Viewer, rng: np.random.Generator) -> None:
     """What a browser makes of poses that are sent link on link is the robot's kinematics."""
     page, robot = cup.page, cup.page.robot
     page.drag_motors(robot.random(rng, 1)[0])
@@ -70,7 +70,7 @@ def test_links_stand_where_they_hang(cup: viewing.Viewer, rng: np.random.Generat
             assert np.abs(place - links[name.rpartition("/")[2]]).max() < 1e-8
 
 
-def test_an_unreachable_contact_shows_why_and_what_is_nearest(cup: viewing.Viewer) -> None:
+def test_unreachable_contact_shows_reason_and_nearest(cup: viewing.Viewer) -> None:
     page, robot = cup.page, cup.page.robot
     page.drag("object", shifted(page.request.object_pose, -0.6, 0.0, 0.0))
     assert page.work.settle(300)
@@ -85,7 +85,7 @@ def test_an_unreachable_contact_shows_why_and_what_is_nearest(cup: viewing.Viewe
     assert result.reasons[0].split(":")[0] in page._panel._results.content
 
 
-def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
+def test_drag_beyond_reach_does_not_wait_for_the_diagnosis(
     cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page, results_drawn, draw = cup.page, [], cup.page.draw
@@ -111,7 +111,7 @@ def test_a_drag_beyond_reach_does_not_wait_for_the_reason(
     assert any("thumb" in line for line in at_rest.reasons)
 
 
-def test_a_dragged_table_is_what_answers_keep_off(cup: viewing.Viewer) -> None:
+def test_answers_avoid_a_dragged_table(cup: viewing.Viewer) -> None:
     page = cup.page
     pose = page.request.scene.items["table"].pose
     page.drag("table", shifted(pose, -1.3, 0.0, 0.36))
@@ -132,7 +132,7 @@ def test_a_dragged_table_is_what_answers_keep_off(cup: viewing.Viewer) -> None:
     assert page.result.success
 
 
-def test_all_solutions_can_be_gone_through(cup: viewing.Viewer) -> None:
+def test_all_solutions_can_be_browsed(cup: viewing.Viewer) -> None:
     page = cup.page
     # Listed once nothing moves, so after the drag is answered.
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.0, 0.0, 0.001))
@@ -149,7 +149,7 @@ def test_all_solutions_can_be_gone_through(cup: viewing.Viewer) -> None:
     assert f"{len(q_shown)} of {len(q_shown)}" in page._panel._solution.content
 
 
-def test_all_solutions_and_another_method_are_seen_at_once(cup: viewing.Viewer) -> None:
+def test_solutions_and_methods_are_shown_together(cup: viewing.Viewer) -> None:
     page, scene = cup.page, cup._server.scene
     page.show_ghosts(True)
     page.compare("enhanced-dls")
@@ -165,7 +165,7 @@ def test_all_solutions_and_another_method_are_seen_at_once(cup: viewing.Viewer) 
     assert not any(name.startswith(("/ghosts/", "/beside")) for name in left)
 
 
-def test_steps_are_taken_back_and_done_again(cup: viewing.Viewer) -> None:
+def test_undo_and_redo(cup: viewing.Viewer) -> None:
     page = cup.page
     poses = [page.request.object_pose[:3, 3]]
     for step in (0.01, 0.02):
@@ -179,7 +179,7 @@ def test_steps_are_taken_back_and_done_again(cup: viewing.Viewer) -> None:
         assert page.result.success
 
 
-def test_a_dragged_object_is_grasped_all_the_way(cup: viewing.Viewer) -> None:
+def test_dragged_object_stays_grasped(cup: viewing.Viewer) -> None:
     page = cup.page
     start, point_before = page.request.object_pose, page.request.grasp.contacts["thumb"].point
     for angle in np.linspace(0.0, 2 * np.pi, 12):
@@ -190,7 +190,7 @@ def test_a_dragged_object_is_grasped_all_the_way(cup: viewing.Viewer) -> None:
         assert np.allclose(page.request.grasp.contacts["thumb"].point - point_before, shift)
 
 
-def test_a_page_needs_no_server_once_it_is_written(cup: viewing.Viewer, tmp_path: Path) -> None:
+def test_written_page_needs_no_server(cup: viewing.Viewer, tmp_path: Path) -> None:
     text = cup.to_html(tmp_path / "scene.html")
     assert (tmp_path / "scene.html").read_text(encoding="utf-8") == text
     assert "<title>cup</title>" in text
@@ -198,7 +198,7 @@ def test_a_page_needs_no_server_once_it_is_written(cup: viewing.Viewer, tmp_path
     assert not re.search(r'(src|href)="https?://', text)
 
 
-def test_another_robot_grasp_and_scene_are_opened(robot: ik.ArmHand) -> None:
+def test_robot_grasp_and_scene_can_be_opened(robot: ik.ArmHand) -> None:
     viewer = viewing.view_grasp(robot, ik.load_grasp("cup"))
     assert "collision not checked" in viewer.page.result.sentence
     opened = (
@@ -225,7 +225,7 @@ def test_another_robot_grasp_and_scene_are_opened(robot: ik.ArmHand) -> None:
     viewer.stop()
 
 
-def test_a_moved_scene_is_saved_as_it_stands(cup: viewing.Viewer, tmp_path: Path) -> None:
+def test_moved_scene_is_saved(cup: viewing.Viewer, tmp_path: Path) -> None:
     page = cup.page
     page.drag("table", shifted(page.request.scene.items["table"].pose, 0.1, 0.0, -0.05))
     assert page.work.settle(300)
@@ -234,7 +234,7 @@ def test_a_moved_scene_is_saved_as_it_stands(cup: viewing.Viewer, tmp_path: Path
     assert np.allclose(saved_scene.items["table"].pose, page.request.scene.items["table"].pose)
 
 
-def test_motors_moved_by_hand_are_judged_and_not_solved(cup: viewing.Viewer) -> None:
+def test_manually_moved_motors_are_judged_not_solved(cup: viewing.Viewer) -> None:
     page = cup.page
     q = page.result.q.copy()
     q[0] += 0.2
@@ -245,7 +245,7 @@ def test_motors_moved_by_hand_are_judged_and_not_solved(cup: viewing.Viewer) -> 
     assert all(verdict.position_error > 5e-3 for verdict in page.result.verdicts.values())
 
 
-def test_settings_are_those_that_it_is_solved_with(cup: viewing.Viewer) -> None:
+def test_settings_reach_the_solver(cup: viewing.Viewer) -> None:
     page = cup.page
     tight = ik.Tolerance(1e-6, 1e-6)
     tightly = viewing.Settings(tolerance=tight, prefer="limits")
@@ -256,7 +256,7 @@ def test_settings_are_those_that_it_is_solved_with(cup: viewing.Viewer) -> None:
     assert max(verdict.position_error for verdict in page.result.verdicts.values()) <= 1e-6
 
 
-def test_a_solver_moves_what_stands_about_it(robot: ik.ArmHand) -> None:
+def test_solver_moves_scene_objects(robot: ik.ArmHand) -> None:
     solver, grasp = ik.Solver(robot, scene=ik.load_scene("table")), ik.load_grasp("cup")
     pose = shifted(solver.scene.items["table"].pose, -1.3, 0.0, 0.36)
     moved_solver = solver.moved("table", pose)

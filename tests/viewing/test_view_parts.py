@@ -25,7 +25,7 @@ def rotated_pose(x: float, y: float, z: float, *angles: float) -> np.ndarray:
     return frame_matrix(Frame((x, y, z), angles or (0.3, -0.2, 0.9)))
 
 
-def test_quaternions_are_those_of_rotations_of_any_angle(rng: np.random.Generator) -> None:
+def test_quaternions_of_any_rotation(rng: np.random.Generator) -> None:
     axes = rng.normal(size=(200, 3))
     angles = np.concatenate([rng.uniform(-np.pi, np.pi, 196), [0.0, np.pi, -np.pi, 1e-9]])
     half_angles = angles[:, None] / 2
@@ -42,7 +42,7 @@ def test_quaternions_are_those_of_rotations_of_any_angle(rng: np.random.Generato
     assert np.allclose(poses_again, poses, atol=1e-12)
 
 
-def test_each_hand_of_a_body_has_a_camera_that_sees_it() -> None:
+def test_each_hand_has_a_camera() -> None:
     robot = ik.load_robot("g1+dex3")
     found_cameras = cameras(robot, robot.home)
     assert list(found_cameras) == ["Robot", "Left", "Right"]
@@ -54,7 +54,7 @@ def test_each_hand_of_a_body_has_a_camera_that_sees_it() -> None:
         assert camera.radius < 0.5 * found_cameras["Robot"].radius
 
 
-def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
+def test_one_finger_may_be_free_but_not_all(robot: ik.ArmHand) -> None:
     request = request_of(robot, ik.load_grasp("cup"), None)
     for finger in robot.fingers[:-1]:
         request = request.with_use(finger, is_used=False, uses_normal=True)
@@ -69,7 +69,7 @@ def test_a_finger_may_be_left_free_but_not_all(robot: ik.ArmHand) -> None:
     "vectors",
     [{"normal": [0, 0, 1]}, {"line": [0, 0, 1]}, {"plane": [0, 0, 1]}, {"ball": [0, 0, 1]}],
 )
-def test_every_kind_of_contact_is_asked_as_it_is_and_turns(robot: ik.ArmHand, vectors) -> None:
+def test_every_contact_kind_is_requested_and_turned(robot: ik.ArmHand, vectors) -> None:
     (kind,), contact = vectors, ik.Contact([0.3, 0.1, 0.5], **vectors)
     request = request_of(robot, ik.Grasp({"thumb": contact}), None)
     contact_read = request.grasp.contacts["thumb"]
@@ -87,7 +87,7 @@ def test_every_kind_of_contact_is_asked_as_it_is_and_turns(robot: ik.ArmHand, ve
         assert np.allclose(getattr(faced, kind), [0.6, 0.0, 0.8], atol=1e-12)
 
 
-def test_what_is_saved_is_read_back(robot: ik.ArmHand, tmp_path: Path) -> None:
+def test_saved_grasp_is_read_back(robot: ik.ArmHand, tmp_path: Path) -> None:
     shipped = ik.load_grasp("cup")
     special = ik.Contact([1 / 3, 0.1, -0.2], [0, 0, 1], ik.Tolerance(1e-3, 0.02), tangent=[1, 0, 0])
     contacts = dict(shipped.contacts) | {
@@ -113,7 +113,7 @@ def test_what_is_saved_is_read_back(robot: ik.ArmHand, tmp_path: Path) -> None:
         assert contact_read.tolerance == contact.tolerance
 
 
-def test_only_the_newest_change_of_a_key_is_done() -> None:
+def test_only_the_newest_change_is_applied() -> None:
     begun, go_on, done = threading.Event(), threading.Event(), []
 
     def first() -> None:
@@ -135,7 +135,7 @@ def test_only_the_newest_change_of_a_key_is_done() -> None:
     work.stop()
 
 
-def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
+def test_deferred_work_is_cancelled() -> None:
     begun, done = threading.Event(), []
 
     def long() -> None:
@@ -154,7 +154,7 @@ def test_what_can_wait_is_given_up_when_the_hand_moves_on() -> None:
     work.stop()
 
 
-def test_a_change_that_fails_does_not_end_the_page(caplog: pytest.LogCaptureFixture) -> None:
+def test_failing_change_does_not_end_the_page(caplog: pytest.LogCaptureFixture) -> None:
     done = []
     work = LatestOnly(lambda: done.append("drawn"))
     work.submit("bad", lambda: 1 / 0)
@@ -189,7 +189,7 @@ def test_bodies_are_closed_and_wind_outwards() -> None:
             assert np.allclose(np.cross(b - a, c - a).sum(axis=0), 0, atol=1e-9)
 
 
-def test_nothing_is_written_where_pads_are_not_stated(description: Path) -> None:
+def test_unstated_pads_are_not_written(description: Path) -> None:
     text = description.read_text()
     with pytest.raises(ik.errors.DescriptionError, match=r"fingers\.third"):
         save_pads(description, {"third": LinkPad(np.zeros(3), np.array([1.0, 0.0, 0.0]))})
@@ -198,7 +198,7 @@ def test_nothing_is_written_where_pads_are_not_stated(description: Path) -> None
         with_corrected_pad(text, "third", np.zeros(3), np.ones(3))
 
 
-def test_links_look_as_their_files_show_them(description: Path) -> None:
+def test_links_look_like_their_files(description: Path) -> None:
     surfaces = {body.name: body.surface for body in visual_bodies(ik.load_robot(description))}
     assert {"pad first", "pad second"} <= set(surfaces)
     for link in ("first_2", "second_2"):

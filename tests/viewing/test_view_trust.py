@@ -99,7 +99,7 @@ def pressed(handle: Any) -> dict[str, Any]:
         ("127.0.0.1.evil.example:8080", None),
     ],
 )
-def test_a_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str | None) -> None:
+def test_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str | None) -> None:
     with pytest.raises(InvalidStatus) as caught:
         opened(cup.url, host, origin)
     assert caught.value.response.status_code == 403
@@ -108,7 +108,7 @@ def test_a_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str |
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
-def test_the_page_itself_is_answered(cup: viewing.Viewer, name: str) -> None:
+def test_own_page_is_answered(cup: viewing.Viewer, name: str) -> None:
     """Also through a tunnel: the port may be another one."""
     address = urlsplit(cup.url)
     assert b"<html" in fetch_page(cup.url, Host=f"{name}:9999")[1].lower()
@@ -117,7 +117,7 @@ def test_the_page_itself_is_answered(cup: viewing.Viewer, name: str) -> None:
             assert greeted(page)
 
 
-def test_where_can_be_written_the_address_has_a_token(pads, description: Path) -> None:
+def test_writable_page_needs_a_token(pads, description: Path) -> None:
     address, text_before = urlsplit(pads.url), description.read_text()
     assert len(address.path) > 20
     assert fetch_page(pads.url)[0] == 200
@@ -136,7 +136,7 @@ def test_where_can_be_written_the_address_has_a_token(pads, description: Path) -
     assert description.read_text() != text_before
 
 
-def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
+def test_disabled_button_cannot_be_pressed(description: Path) -> None:
     text_before, viewer = description.read_text(), viewing.view_pads(description, host="0.0.0.0")
     assert viewer.page._save_button.disabled
     with opened(viewer.url) as page:
@@ -154,7 +154,7 @@ def test_a_button_that_is_off_cannot_be_pressed(description: Path) -> None:
     viewer.stop()
 
 
-def test_nothing_is_shared(cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sessions_share_nothing(cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
     servers: list[Any] = []
 
     def tunnel(*words: Any) -> None:
@@ -170,7 +170,7 @@ def test_nothing_is_shared(cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch)
     assert servers == []
 
 
-def test_malformed_messages_neither_end_the_page_nor_fill_the_terminal(tmp_path: Path) -> None:
+def test_malformed_messages_are_harmless(tmp_path: Path) -> None:
     code = (
         "from casadi_ik.app import viewer as viewing; import casadi_ik as ik, sys\n"
         "viewer = viewing.view_grasp(ik.load_robot('kuka_lwr_barrett'), ik.load_grasp('cup'))\n"
