@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+from compilation import forget
 
 
 @pytest.fixture(scope="session")
@@ -15,3 +18,12 @@ def own_cache(session_cache: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests share one cache, apart from the user's and from tests of the cache itself."""
     monkeypatch.setenv("CASADI_IK_CACHE", session_cache)
     monkeypatch.delenv("CASADI_IK_CFLAGS", raising=False)
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Path of an empty cache, in a process without loaded libraries and issued warnings."""
+    place = tmp_path / "cache"
+    monkeypatch.setenv("CASADI_IK_CACHE", str(place))
+    forget(monkeypatch)
+    return place
