@@ -392,7 +392,7 @@ def solve_parts(
         # argument as the literal "auto".
         batch_size: Any = 1
         parallel = joblib.Parallel(return_as="generator_unordered", batch_size=batch_size)
-        parts = source.without(done)
+        parts = source.remaining_parts(done)
         if object_pose is not None:
             parts = (
                 replace(part, arrays=transform_arrays(part.arrays, object_pose)) for part in parts

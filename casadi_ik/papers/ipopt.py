@@ -446,18 +446,18 @@ class IpoptMethod(Method):
         """Layout of the log record of an iteration."""
         robot = self._robot
         return Layout.record(
-            Q.of(robot, "actuator positions before the step"),
-            COST.of(robot, "squared residual before the step"),
+            Q.for_robot(robot, "actuator positions before the step"),
+            COST.for_robot(robot, "squared residual before the step"),
             Field("barrier", (), "f8", "", "Ipopt's barrier parameter mu"),
-            POSITION_ERROR.of(robot),
-            ANGLE_ERROR.of(robot),
+            POSITION_ERROR.for_robot(robot),
+            ANGLE_ERROR.for_robot(robot),
             Field("infeasibility", (), "f4", "", "largest violation of a constraint (inf_pr)"),
             Field("regularization", (), "f4", "", "added to the diagonal of the Hessian"),
-            STEP_SIZE.of(robot, "largest motor change of the step"),
-            LIMIT_MASK.of(robot),
-            RESTART.of(robot, "number of the start, 0 that from q0"),
-            PHASE.of(robot),
-            STATUS.of(robot),
+            STEP_SIZE.for_robot(robot, "largest motor change of the step"),
+            LIMIT_MASK.for_robot(robot),
+            RESTART.for_robot(robot, "number of the start, 0 that from q0"),
+            PHASE.for_robot(robot),
+            STATUS.for_robot(robot),
         )
 
     @property

@@ -28,8 +28,8 @@ class Reason(StrEnum):
     HAND = "the contacts do not fit the hand, wherever the palm is"
     REACH = "the hand fits the contacts, but the arm does not reach there"
     LIMITS = "limits of actuators block the grasp"
-    NOT_FOUND = "no solution was found, and no reason why there should be none"
-    REACHABLE = "the contacts can be reached; the method did not find the way"
+    NOT_FOUND = "neither a solution nor a proof was found, and no cause is known"
+    REACHABLE = "the contacts can be reached, but the method did not find a solution"
 
 
 MAX_ADVICE = Tolerance(position=0.02, angle=math.radians(15.0))
@@ -48,7 +48,7 @@ class HandFit:
     """Fit of the hand alone, with a floating palm, to the contacts.
 
     Attributes:
-        fits: Whether every contact is within tolerance.
+        fits: True if every contact is within tolerance.
         contacts: Errors by finger.
     """
 
@@ -84,7 +84,7 @@ class Relief:
     Attributes:
         lifted: Name of an actuator, or "arm", "hand" or "all" for all limits of these.
         beyond: Limit violation of the solution by actuator [rad or m]: > 0 above the upper limit,
-            < 0 below the lower one. No smaller violation was found.
+            < 0 below the lower limit. It is the smallest violation that was found.
         units: Unit by actuator.
         q: (n,) solution [rad or m].
     """
@@ -148,12 +148,12 @@ class LazyRemedies:
         self._find = find
 
     @cached_property
-    def found(self) -> Remedies:
-        """The remedies, computed once."""
+    def remedies(self) -> Remedies:
+        """Remedies, computed once."""
         return self._find()
 
     def __getstate__(self) -> dict[str, Remedies]:
-        return {"found": self.found}
+        return {"remedies": self.remedies}
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -169,16 +169,17 @@ class Diagnosis(ReprMixin):
         searches: Number of starts of the search for a solution.
         hand: Fit of the hand alone; None for a hand without an arm.
         reach: Reach of the arm; None unless the arm has a closed form and the hand fits.
-        active: Actuators at a limit in the nearest configuration.
-        enough: Tolerance with which the grasp is solvable.
+        active: Actuators that are at a limit in the nearest configuration.
+        enough: Tolerance within which the grasp is solvable.
         nearest: Contacts of the nearest configuration, by finger.
         q: (n,) nearest configuration [rad or m]; a solution if the reason is `REACHABLE`.
-        time: Duration of the diagnosis without the remedies [s]; in a batch its share.
+        time: Duration of the diagnosis without the remedies [s]; in a batch the share of the
+            target.
         lazy: Source of the remedies.
         palm: Errors of the palm in the nearest configuration; None for targets without palm
             poses.
-        sides: Worst contact of each side of a multi-arm robot that has contacts, solved by itself
-            with the trunk; empty for a single arm.
+        sides: Worst contact of each side of a multi-arm robot with contacts, solved for this side
+            and the trunk alone; empty for a single arm.
 
     Example:
         >>> far.status.name, far.diagnosis.reason.name, far.diagnosis.hand.fits
@@ -206,18 +207,18 @@ class Diagnosis(ReprMixin):
 
     @property
     def established(self) -> bool:
-        """Whether the reason is proved."""
+        """True if the reason is proved."""
         return self.proof is not None
 
     @property
     def reliefs(self) -> tuple[Relief, ...]:
         """Limits whose removal makes the grasp solvable."""
-        return self.lazy.found.reliefs
+        return self.lazy.remedies.reliefs
 
     @property
     def freed(self) -> tuple[Freed, ...]:
         """Fingers and normals whose release makes the grasp solvable."""
-        return self.lazy.found.freed
+        return self.lazy.remedies.freed
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -229,7 +230,7 @@ class Diagnosis(ReprMixin):
         lines = [f"{likely}{reason}", *self._evidence_lines(), *self._proof_lines()]
         for relief in self._smallest_reliefs:
             violations = ", ".join(
-                f"{name} {_length(value, relief.units[name])} {_side(value)}"
+                f"{name} {_length(value, relief.units[name])} {_violated_side(value)}"
                 for name, value in relief.beyond.items()
             )
             lines.append(f"solvable with limits lifted: {violations}")
@@ -267,7 +268,7 @@ class Diagnosis(ReprMixin):
 
     def _evidence_lines(self) -> list[str]:
         lines = [
-            f"{name} by itself: nothing found closer than "
+            f"{name} alone: no configuration found closer than "
             f"{_format_error(worst.position_error, worst.angle_error)}"
             for name, worst in self.sides.items()
             if not worst.ok
@@ -297,7 +298,7 @@ def _length(value: float, unit: str) -> str:
     return f"{size:.3g} {name}" if size < 100 else f"{size:.0f} {name}"
 
 
-def _side(value: float) -> str:
+def _violated_side(value: float) -> str:
     return "above" if value > 0 else "below"
 
 

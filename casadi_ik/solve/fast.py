@@ -1,4 +1,4 @@
-"""A solver of single targets with arrays in and out, for control loops."""
+"""Solver of single targets with array inputs and outputs, for control loops."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class FastSolver:
     contact vectors beyond point and normal, or fixed actuators, and Ctrl-C takes effect when the
     kernel returns (0.2 s at most).
 
-    An instance stores one result: each thread needs its own.
+    An instance stores one result; create one instance per thread.
 
     Attributes:
         position_error: (f,) distances of the last result [m], NaN where free; the next call
@@ -103,7 +103,7 @@ class FastSolver:
     def _solve_as_batch(
         self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None
     ) -> tuple[Array, Status]:
-        """Solve as a batch of one: without a compiler, and to report malformed input.
+        """Solve as a batch of one target: without a compiler, and to report malformed input.
 
         Raises:
             InputError: Wrong shapes or numbers.

@@ -17,7 +17,7 @@ from casadi_ik.solve.thumb_first.method import ThumbFirstMethod
 from casadi_ik.solve.thumb_first.parameters import ThumbFirstParameters
 
 Build = Callable[[RobotDescription, Any, bool], Method]
-"""Function of robot, parameter record and whether to compile that builds a method."""
+"""Function that builds a method from a robot, a parameter record and a flag to compile."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +83,14 @@ def register_method(
     """Register a method for `Solver` under a name, in this process.
 
     Args:
-        name: Name of the method; also `Method.name` of what `build` returns.
+        name: Name of the method; also the `Method.name` that `build` returns.
         summary: One-line description.
         parameters: Parameter record, a dataclass whose fields have defaults;
             `Solver(options=)` sets them.
-        build: Function of robot, parameter record and whether to compile that returns the method,
-            for example a subclass of `LoopedMethod`.
+        build: Function that returns the method, for example a subclass of `LoopedMethod`, from
+            a robot, a parameter record and a flag to compile.
         fixed: Values of fields of the record that users cannot set.
-        replace: Whether to replace a method registered before.
+        replace: True to replace a registered method.
 
     Raises:
         InputError: The name is taken, or an argument has the wrong type.
@@ -102,7 +102,7 @@ def register_method(
         ...     damping: float = 0.1
         >>> def build(robot, parameters, compiled):
         ...     raise NotImplementedError("make a `LoopedMethod`: docs/add_a_method.md")
-        >>> ik.register_method("mine", "what it does", Parameters, build)
+        >>> ik.register_method("mine", "summary of the method", Parameters, build)
     """
     if not (isinstance(name, str) and name):
         raise InputError(f"name: found {name!r}, expected the name of a method")

@@ -6,8 +6,9 @@ conflict:
 
     dq = -(dr/dq)^+ dr/dt dt
 
-over the motors that are free to move. A motor at a limit stays there. Motions that the contacts
-leave free are zero: the pseudo-inverse returns the smallest motion (scaled by `motor_scales`).
+over the motors that can move. A motor at a limit does not move. Motions that the
+contacts leave free are zero: the pseudo-inverse returns the smallest motion (scaled by
+`motor_scales`).
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ PSEUDO_INVERSE_DAMPING, PSEUDO_INVERSE_PASSES = 1e-7, 5
 """Damping of the squared singular values, and number of refinements that remove its effect.
 
 The remaining effect is 1e-5 of a singular value of 1e-3. Singular values below 3e-4 count as free
-motions. With a damping of 1e-8 the rounding of free motions appears in the others (3e-7)."""
+motions. With a damping of 1e-8, rounding errors of free motions appear in other motions (3e-7)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivity(RecordReprMixin):
-    """Derivatives of configurations, or of a scalar of them, by the contacts.
+    """Derivatives of configurations, or of a scalar function of them, by the contacts.
 
     Attributes:
         points: (..., f, 3) derivatives by contact points [1/m]; 0 where free.
@@ -64,8 +65,8 @@ class SensitivityKernel:
         self._inputs |= {field.name: (f, field.size // f) for field in self._contacts.fields}
         size = sum(rows * columns for rows, columns in self._inputs.values())
         self._name = name = ca.Function.fix_name(f"{robot.name}_sensitivity{kinds_suffix(kinds)}")
-        self._shapes, known = {"given": (size, 1)}, recipe(name, robot, kinds)
-        self._outputs, self._recipe, self._compiled = ((6 * f, 1),), known, compiled
+        self._shapes, graph_recipe = {"inputs": (size, 1)}, recipe(name, robot, kinds)
+        self._outputs, self._recipe, self._compiled = ((6 * f, 1),), graph_recipe, compiled
 
     @cached_property
     def _kernel(self) -> FunctionKernel:
@@ -80,8 +81,8 @@ class SensitivityKernel:
         low, high = targets.bounds(self._robot, np.inf)
         values: dict[str, Any] = {"q": q, "gradient": gradients}
         values["free"] = (q - low >= LIMIT_DISTANCE) & (high - q >= LIMIT_DISTANCE)
-        known = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
-        values["weights"] = np.stack(known, axis=2)
+        is_constrained = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
+        values["weights"] = np.stack(is_constrained, axis=2)
         for name in self._inputs.keys() - values.keys():
             values[name] = np.nan_to_num(targets.vectors(name))
         columns = [values[name].reshape(len(q), -1) for name in self._inputs]
@@ -90,29 +91,29 @@ class SensitivityKernel:
         return Sensitivity(points, normals)
 
     def _graph(self) -> ca.Function:
-        """Build the graph of all inputs, stacked -> derivatives by points, then by normals."""
-        inputs, first, robot = dict[str, ca.SX](), 0, self._robot
+        """Return the graph from the stacked inputs to the derivatives by points and normals."""
+        inputs, offset, robot = dict[str, ca.SX](), 0, self._robot
         ((_, shape),) = self._shapes.items()
-        column = ca.SX.sym("given", *shape)
+        column = ca.SX.sym("inputs", *shape)
         for name, (rows, columns) in self._inputs.items():
-            values = column[first : first + rows * columns]
-            inputs[name], first = ca.reshape(values, columns, rows).T, first + rows * columns
+            values = column[offset : offset + rows * columns]
+            inputs[name], offset = ca.reshape(values, columns, rows).T, offset + rows * columns
         residual = contact_residual(robot, self._contacts, inputs["q"], inputs)
         scales = inputs["free"] * motor_scales(robot)
         rates = ca.jacobian(residual, inputs["q"]) @ ca.diag(scales)
-        square = ca.densify(
+        normal_matrix = ca.densify(
             rates.T @ rates + PSEUDO_INVERSE_DAMPING * ca.DM.eye(len(robot.actuators))
         )
-        step = solve_spd(square, scales * inputs["gradient"])
+        step = solve_spd(normal_matrix, scales * inputs["gradient"])
         total = step
         for _ in range(PSEUDO_INVERSE_PASSES - 1):
-            step = PSEUDO_INVERSE_DAMPING * solve_spd(square, step)
+            step = PSEUDO_INVERSE_DAMPING * solve_spd(normal_matrix, step)
             total = total + step
         by_points, by_normals = (
             -ca.jtimes(residual, inputs[name], rates @ total, True)
             for name in ("points", "normals")
         )
-        along = ca.sum2(by_normals * inputs["normals"])
-        by_normals = by_normals - ca.repmat(along, 1, 3) * inputs["normals"]
+        component_along_normal = ca.sum2(by_normals * inputs["normals"])
+        by_normals = by_normals - ca.repmat(component_along_normal, 1, 3) * inputs["normals"]
         result = ca.vertcat(ca.vec(by_points.T), ca.vec(by_normals.T))
         return ca.Function(self._name, [column], [ca.densify(ca.cse(result))])

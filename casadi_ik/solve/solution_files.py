@@ -22,7 +22,7 @@ from casadi_ik.solve.solution import Ranking, Solution
 
 
 def solution_data(solution: Solution) -> dict[str, Any]:
-    """Return a solution as JSON data; null stands for non-finite numbers (a free finger)."""
+    """Return a solution as JSON data, with null for non-finite numbers (a free finger)."""
     names = ["success", "status", "method", "robot", "actuators", "q", "iterations", "restarts"]
     names += ["time", "contacts", "diagnosis"]
     names += ["palm"] if solution.palm is not None else []
@@ -66,7 +66,7 @@ RANKED_MEMBER = "ranked"
 
 
 class RankedSolution(msgspec.Struct, frozen=True):
-    """The solution of a ranked entry, as far as it is read.
+    """Solution of a ranked entry; only the fields that are read.
 
     Attributes:
         robot: Name of the robot.
@@ -80,7 +80,7 @@ class RankedSolution(msgspec.Struct, frozen=True):
 
 
 class RankedEntry(msgspec.Struct, frozen=True):
-    """An entry of a ranking in a file.
+    """Entry of a ranking in a file.
 
     Attributes:
         candidate: Index of the grasp among the candidates.
@@ -105,26 +105,26 @@ class RankedEntry(msgspec.Struct, frozen=True):
         """Short description of the entry."""
         return f"{self.name or 'candidate'} ({self.candidate}), score {self.score:.4g}"
 
-    def placed(self, path: Path, place: int) -> Grasp:
+    def to_grasp(self, path: Path, rank: int) -> Grasp:
         """Return the grasp with its pregrasp.
 
         Args:
             path: File of the entry.
-            place: Rank of the entry, from 1.
+            rank: Rank of the entry, from 1.
 
         Raises:
             DescriptionError: The grasp is missing or malformed.
         """
-        where = f"ranked[{place - 1}]."
+        prefix = f"ranked[{rank - 1}]."
         if self.grasp is None:
-            expected = "expected what `casadi-ik choose` writes now"
-            raise DescriptionError(f"{path}: {where}grasp: missing, {expected}")
+            expected = "expected the format of `casadi-ik choose`"
+            raise DescriptionError(f"{path}: {prefix}grasp: missing, {expected}")
         grasp = grasp_from_entry(
-            self.grasp, path, self.name or f"{path.stem}[{place - 1}]", f"{where}grasp."
+            self.grasp, path, self.name or f"{path.stem}[{rank - 1}]", f"{prefix}grasp."
         )
         if self.pregrasp is None:
             return grasp
-        pregrasp = grasp_from_entry(self.pregrasp, path, grasp.name, f"{where}pregrasp.")
+        pregrasp = grasp_from_entry(self.pregrasp, path, grasp.name, f"{prefix}pregrasp.")
         return replace(grasp, pregrasp=pregrasp)
 
 
@@ -134,7 +134,7 @@ class _RankedFile(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, eq=False)
 class ChosenPosture:
-    """The configuration of a ranked entry, as the goal of `Solver.reach`.
+    """Configuration of a ranked entry, as the goal of `Solver.reach`.
 
     Attributes:
         grasp: Grasp in the base frame.
@@ -160,14 +160,16 @@ def chosen_posture(path: Path, rank: int) -> ChosenPosture:
     """
     entries = read_ranked(path)
     if rank > len(entries):
-        raise InputError(f"--rank: found {rank}, but {path} has {len(entries)} answers")
+        raise InputError(
+            f"--rank: found {rank}, expected at most {len(entries)}, the entries of {path}"
+        )
     entry = entries[rank - 1]
     q = np.array(entry.solution.q)
-    return ChosenPosture(entry.placed(path, rank), q, entry.solution.robot)
+    return ChosenPosture(entry.to_grasp(path, rank), q, entry.solution.robot)
 
 
 def is_ranked(path: Path) -> bool:
-    """Return whether a file contains a ranking of ``casadi-ik choose`` or ``casadi-ik grasp``."""
+    """Return True for a file with a ranking of ``casadi-ik choose`` or ``casadi-ik grasp``."""
     if path.suffix.lower() != ".npz":
         return path.suffix.lower() == ".json"
     try:
@@ -178,14 +180,14 @@ def is_ranked(path: Path) -> bool:
 
 
 def _member(path: Path) -> bytes:
-    """Return the ranking that ``casadi-ik grasp`` has written beside its arrays."""
+    """Return the ranking that ``casadi-ik grasp`` stores with its arrays."""
     try:
         arrays = read_npz(path, LIMITS.ranked_bytes)
     except DescriptionError as error:
         raise InputError(str(error)) from error
     if RANKED_MEMBER not in arrays:
         raise InputError(
-            f"{path}: {RANKED_MEMBER}: missing, expected what `casadi-ik grasp` writes"
+            f"{path}: {RANKED_MEMBER}: missing, expected the format of `casadi-ik grasp`"
         )
     return arrays[RANKED_MEMBER].astype(np.uint8).tobytes()
 
@@ -212,7 +214,7 @@ def read_ranked(path: Path) -> list[RankedEntry]:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         text = str(error).replace("`$.", "`")
-        raise InputError(f"{path}: expected what `casadi-ik choose` writes: {text}") from error
+        raise InputError(f"{path}: expected the format of `casadi-ik choose`: {text}") from error
     if not entries:
-        raise InputError(f"{path}: ranked: found none, expected at least one answer")
+        raise InputError(f"{path}: ranked: found none, expected at least one entry")
     return entries

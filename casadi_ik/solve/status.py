@@ -23,19 +23,19 @@ class Status(IntEnum):
     RUNNING = 0
     """The solve continues (only as the status of a step)."""
     SOLVED = 1
-    """Every contact is within tolerance, and q within limits if they are enforced."""
+    """The contacts are within tolerance, and q is within the limits if these are enforced."""
     STALLED = 2
-    """The cost no longer decreases, and a contact is not within tolerance."""
+    """The cost no longer decreases, but a contact is not within tolerance."""
     ITERATION_LIMIT = 3
     """The maximum number of iterations is reached."""
     UNREACHABLE = 4
-    """It is proved that the contacts cannot be reached, see `Diagnosis.proof`."""
+    """A proof shows that the contacts cannot be reached, see `Diagnosis.proof`."""
     NOT_FOUND = 5
     """The diagnosis found neither a solution nor a proof that there is none."""
     COLLISION = 6
     """Contacts and limits are met, but the robot is in collision, see `Solution.collision`."""
     NEAREST = 7
-    """The nearest configuration found, as `best_effort` requests, for lack of a solution."""
+    """A solution was not found; q is the nearest configuration, as `best_effort` requests."""
 
     @classmethod
     def from_loop(cls, codes: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -85,5 +85,5 @@ class Phase(IntEnum):
     @classmethod
     def labels(cls) -> tuple[str, ...]:
         """Return the names of the codes 0, 1, ..., "" for unused codes, for the log."""
-        known = {phase.value: phase.label for phase in cls}
-        return tuple(known.get(code, "") for code in range(max(cls) + 1))
+        label_by_code = {phase.value: phase.label for phase in cls}
+        return tuple(label_by_code.get(code, "") for code in range(max(cls) + 1))

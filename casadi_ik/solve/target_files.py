@@ -113,11 +113,11 @@ class TargetFile:
 
     @contextmanager
     def _member(self, archive: zipfile.ZipFile, key: str) -> Iterator[_Member]:
-        where, names = f"{self.path}: {key}", archive.namelist()
+        location, names = f"{self.path}: {key}", archive.namelist()
         if f"{key}.npy" not in names:
-            found = ", ".join(name.removesuffix(".npy") for name in names) or "nothing"
+            member_names = ", ".join(name.removesuffix(".npy") for name in names) or "nothing"
             raise InputError(
-                f"{where}: missing, expected {' and '.join(REQUIRED_KEYS)}; found {found}"
+                f"{location}: missing, expected {' and '.join(REQUIRED_KEYS)}; found {member_names}"
             )
         try:
             stream = archive.open(f"{key}.npy")
@@ -129,33 +129,33 @@ class TargetFile:
             else:
                 raise ValueError("unsupported version of the npy format")
         except (*READ_ERRORS, OSError) as error:
-            raise InputError(f"{where}: cannot be read: {error}") from error
+            raise InputError(f"{location}: cannot be read: {error}") from error
         with stream:
             if dtype.kind not in "fiu":
-                raise InputError(f"{where}: found values of type {dtype}, expected numbers")
+                raise InputError(f"{location}: found values of type {dtype}, expected numbers")
             expected = f"expected (k, {self.fingers}, 3)"
             if len(shape) != 3 or shape[1:] != (self.fingers, 3) or shape[0] < 0:
-                raise InputError(f"{where}: found shape {shape}, {expected}")
+                raise InputError(f"{location}: found shape {shape}, {expected}")
             if shape[0] == 0:
-                raise InputError(f"{where}: found no targets, {expected}")
+                raise InputError(f"{location}: found no targets, {expected}")
             info, size = archive.getinfo(f"{key}.npy"), shape[0] * self.fingers * 3 * dtype.itemsize
             # The longest header that numpy reads has 10,064 bytes, magic and padding included.
             if not size <= info.file_size <= size + 10_064:
                 comparison = "fewer" if info.file_size < size else "more"
-                raise InputError(f"{where}: damaged: {comparison} bytes than its shape requires")
-            refuse_zip_bomb(where, info.file_size, info.compress_size)
-            yield _Member(where, stream, shape[0], self.fingers, dtype, column_major)
+                raise InputError(f"{location}: damaged: {comparison} bytes than its shape requires")
+            refuse_zip_bomb(location, info.file_size, info.compress_size)
+            yield _Member(location, stream, shape[0], self.fingers, dtype, column_major)
 
 
-def refuse_zip_bomb(where: str, unpacked: int, packed: int) -> None:
+def refuse_zip_bomb(location: str, unpacked: int, packed: int) -> None:
     """Refuse data that unpack to more than 256 MiB and to more than 200 times their size.
 
     Raises:
-        InputError: The data do.
+        InputError: The data exceed both limits.
     """
     if unpacked > scaled_limit(max(2**28, 200 * packed)):
         raise InputError(
-            f"{where}: unpacks to {unpacked >> 20} MiB from {packed} bytes, expected at most "
+            f"{location}: unpacks to {unpacked >> 20} MiB from {packed} bytes, expected at most "
             f"{scaled_limit(200)} times its size {RAISE_HINT}"
         )
 
@@ -164,7 +164,7 @@ def refuse_zip_bomb(where: str, unpacked: int, packed: int) -> None:
 class _Member:
     """An array (k, f, 3) inside a zip file, read sequentially."""
 
-    where: str
+    location: str
     stream: IO[bytes]
     count: int
     fingers: int
@@ -174,25 +174,25 @@ class _Member:
 
     @cached_property
     def _all_rows(self) -> Array:
-        """All rows of a column-major array, whose rows are not contiguous in the file."""
+        """Rows of a column-major array, which are not contiguous in the file."""
         return self._rows(self.count, "F")
 
     def read(self, rows: int, last: bool) -> Array:
-        """Return the next rows; after the last ones, check the end and the checksum."""
+        """Return the next rows; after the last rows, check the end of the file and the checksum."""
         if self.column_major:
             block = self._all_rows[self.position : self.position + rows]
         else:
             block = self._rows(rows, "C")
         self.position += rows
         if last and self._bytes(1):
-            raise InputError(f"{self.where}: damaged: more bytes than its shape requires")
+            raise InputError(f"{self.location}: damaged: more bytes than its shape requires")
         return block
 
     def _rows(self, rows: int, order: Literal["C", "F"]) -> Array:
         size = rows * self.fingers * 3
         data = self._bytes(size * self.dtype.itemsize)
         if len(data) < size * self.dtype.itemsize:
-            raise InputError(f"{self.where}: damaged: fewer bytes than its shape requires")
+            raise InputError(f"{self.location}: damaged: fewer bytes than its shape requires")
         shape = (rows, self.fingers, 3)
         values = np.frombuffer(data, self.dtype).reshape(shape, order=order)
         return values.astype(np.float64)
@@ -201,7 +201,7 @@ class _Member:
         try:
             return self.stream.read(size)
         except (*READ_ERRORS, OSError) as error:
-            raise InputError(f"{self.where}: cannot be read: {error}") from error
+            raise InputError(f"{self.location}: cannot be read: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -343,7 +343,7 @@ class TargetSource:
         """Number of the first target of each part among all targets."""
         return (0, *accumulate(self.sizes))[:-1]
 
-    def without(self, done: Container[int]) -> Iterator[BatchPart]:
+    def remaining_parts(self, done: Container[int]) -> Iterator[BatchPart]:
         """Yield the parts whose numbers are not in `done`, read on demand.
 
         Raises:

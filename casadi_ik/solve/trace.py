@@ -1,11 +1,11 @@
 """Format of traces: the standard fields of all methods, and the measures of their Jacobians.
 
-The record of a method has the standard fields below and fields of its own. Readers of traces
-(events, explanations, pictures) use the standard fields alone; `trace_format` refuses a record
-whose standard fields have another shape, type or unit.
+The record of a method has the standard fields below and fields specific to the method. Readers of
+traces (events, explanations, pictures) use the standard fields alone; `trace_format` refuses a
+record whose standard fields have another shape, type or unit.
 
-The conditioning of Jacobians is measured on finished traces, all rows at once, because solvers do
-not need it and solves without a log should not pay for it.
+The conditioning of Jacobians is computed from finished traces, for all rows in one call: solvers do
+not need it, and solves without a log should not pay for it.
 
 ============  ==================================================================================
 Jacobian      maps
@@ -14,7 +14,7 @@ arm           arm motors to the palm's twist: velocity by `LENGTH`, angular velo
 hand          each finger's motors to the velocity of its contact point in the palm frame, by
               `LENGTH`; the smallest value of all fingers and the largest condition number
 closed_chain  motors of arm and thumb to the five rows of the thumb's contact: velocity of the
-              point by `LENGTH`, turning of the normal. Where these rows lose rank the
+              point by `LENGTH`, rotation of the normal. Where these rows lose rank, the
               closed chain of arm and thumb is singular
 ============  ==================================================================================
 
@@ -73,7 +73,7 @@ class StandardField:
         unit: SI unit, "" if dimensionless.
         doc: One-line description.
         codes: Names of the codes 0, 1, ...; "" for unused codes.
-        required: Whether every method has to record the field.
+        required: True if every method must record the field.
     """
 
     name: str
@@ -84,7 +84,7 @@ class StandardField:
     codes: tuple[str, ...] = ()
     required: bool = True
 
-    def of(self, robot: RobotDescription, doc: str = "") -> Field:
+    def for_robot(self, robot: RobotDescription, doc: str = "") -> Field:
         """Return the field of the record of a robot.
 
         Args:
@@ -101,7 +101,7 @@ class StandardField:
         return Field(self.name, shape, self.dtype, self.unit, doc or self.doc)
 
     def labels(self, robot: RobotDescription) -> tuple[str, ...]:
-        """Return the names of the elements, bits or codes; empty for a plain number."""
+        """Return the names of the elements, bits or codes; empty for a single number."""
         if self.elements in (Elements.ACTUATORS, Elements.ACTUATOR_BITS):
             return robot.actuator_names
         return robot.finger_names if self.elements is Elements.FINGERS else self.codes
@@ -172,7 +172,7 @@ STANDARD_FIELDS = (
     *(Q, POSITION_ERROR, ANGLE_ERROR, COST, STEP_SIZE, DAMPING),
     *(LIMIT_MASK, ACTIVE_MASK, RESTART, ACCEPTED, PHASE, STATUS),
 )
-"""All standard fields."""
+"""Standard fields of all methods."""
 
 SIGMA, CONDITION = "sigma_", "condition_"
 """Prefixes of the fields of the smallest singular value and of the condition number of a Jacobian;
@@ -269,7 +269,7 @@ def trace_format(
     fields = {item.name: item for item in layout}
     labels: dict[str, tuple[str, ...]] = {}
     for standard in STANDARD_FIELDS:
-        expected, item = standard.of(robot), fields.get(standard.name)
+        expected, item = standard.for_robot(robot), fields.get(standard.name)
         if item is None:
             if standard.required:
                 raise InputError(
@@ -307,7 +307,7 @@ class _MeasuredJacobian:
         columns: Columns of q that the Jacobian depends on and maps.
         graph: Graph of smallest singular value and condition number.
         compiled: False: use CasADi's virtual machine.
-        everywhere: Whether to measure it in phases without an arm, too.
+        in_all_phases: True to measure it in phases without an arm too.
         thresholds: Thresholds of smallest singular value and condition number.
     """
 
@@ -315,7 +315,7 @@ class _MeasuredJacobian:
     columns: tuple[int, ...]
     graph: FunctionGraph
     compiled: bool
-    everywhere: bool
+    in_all_phases: bool
     thresholds: tuple[float, float]
 
     @cached_property
@@ -399,7 +399,7 @@ class JacobianMeasures:
             rows_with_arm = np.flatnonzero(has_arm)
         for i, part in enumerate(self._parts):
             columns = slice(2 * i, 2 * i + 2)
-            if part.everywhere or rows_with_arm is None:
+            if part.in_all_phases or rows_with_arm is None:
                 (values[:, columns],) = part.kernel(q)
             else:
                 (values[rows_with_arm, columns],) = part.kernel(np.take(q, rows_with_arm, axis=0))
@@ -456,10 +456,10 @@ def _thumb_contact(robot: RobotDescription, body: ActuatedKinematics) -> tuple[E
     columns = (*robot.arm_actuators, *robot.finger_actuators(thumb))
     linear, angular = body.contact_jacobian(thumb, columns)
     _, normal = body.kinematics.contact(thumb)
-    first = perpendicular(normal)
-    across = ca.horzcat(first, ca.cross(normal, first)).T
+    tangent = perpendicular(normal)
+    tangents = ca.horzcat(tangent, ca.cross(normal, tangent)).T
     return _conditioning(
-        ca.vertcat(linear * (1 / LENGTH), across @ angular), _scales(robot, columns)
+        ca.vertcat(linear * (1 / LENGTH), tangents @ angular), _scales(robot, columns)
     )
 
 

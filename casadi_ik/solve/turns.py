@@ -18,7 +18,7 @@ TURN = 2 * np.pi
 
 
 def search_start(robot: RobotDescription, q: Array) -> Array:
-    """Return configurations (..., n) with motors without limits within half a revolution of zero.
+    """Return configurations with the motors without limits within half a revolution of zero.
 
     Args:
         robot: The robot.
@@ -43,7 +43,7 @@ def nearest_turns(
         q: (..., n) solutions [rad or m].
         reference: (..., n) reference configurations [rad or m].
         bounds: (n,) or (..., n) lower and upper bounds; a motor with equal bounds is fixed.
-        every_motor: Whether to move motors with limits too, within their bounds.
+        every_motor: True to move motors with limits too, within their bounds.
     """
     columns = list(robot.multi_turn)
     if not columns or not (every_motor or robot.continuous.any()):
@@ -51,11 +51,22 @@ def nearest_turns(
     lower, upper = (np.broadcast_to(bound, q.shape)[..., columns] for bound in bounds)
     free = robot.continuous[columns] & (lower < upper)
     angles = q[..., columns]
-    turns = np.floor((reference[..., columns] - angles) / TURN + 0.5)
-    first, last = np.ceil((lower - angles) / TURN), np.floor((upper - angles) / TURN)
-    limited = np.clip(turns, np.minimum(first, 0), np.maximum(last, 0)) if every_motor else 0.0
+    nearest_revolutions = np.floor((reference[..., columns] - angles) / TURN + 0.5)
+    first_revolution, last_revolution = (
+        np.ceil((lower - angles) / TURN),
+        np.floor((upper - angles) / TURN),
+    )
+    revolutions_within_limits = (
+        np.clip(
+            nearest_revolutions, np.minimum(first_revolution, 0), np.maximum(last_revolution, 0)
+        )
+        if every_motor
+        else 0.0
+    )
     result = q.copy()
-    result[..., columns] = angles + TURN * np.where(free, turns, limited)
+    result[..., columns] = angles + TURN * np.where(
+        free, nearest_revolutions, revolutions_within_limits
+    )
     return result
 
 

@@ -309,7 +309,7 @@ RANKED: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     ),
     "short": (lambda data: data["ranked"][0]["solution"].update(q=[1, 2]), "q: found shape (2,)"),
     "words": (lambda data: data["ranked"][0]["solution"].update(q=["a"]), "Expected `float`"),
-    "rank": (lambda _: None, "--rank: found 4, but"),
+    "rank": (lambda _: None, "--rank: found 4, expected at most"),
     "pose": (lambda _: None, "--object-pose: other.json"),
 }
 

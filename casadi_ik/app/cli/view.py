@@ -263,7 +263,7 @@ def _ranked_choices(path: Path, args: Arguments) -> tuple[ArmHand, Choices]:
     for rank, entry in enumerate(ranking, 1):
         with located(f"{path}: ranked[{rank - 1}].solution.q"):
             q = robot.configuration(np.array([entry.solution.q]))[0]
-        grasp = None if entry.grasp is None else entry.placed(path, rank)
+        grasp = None if entry.grasp is None else entry.to_grasp(path, rank)
         choices[f"{rank}. {entry.label}"] = Candidate(
             grasp, q, entry.load, entry.solution.clearance
         )

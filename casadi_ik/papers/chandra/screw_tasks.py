@@ -271,15 +271,15 @@ class ScrewControlStep:
     def record(self) -> Layout:
         """Logged fields of a step; all values except `step_size` refer to its start."""
         return Layout.record(
-            Q.of(self.robot),
+            Q.for_robot(self.robot),
             Field("point", (3,), "f8", "m", "contact point in the frame of the target"),
             Field("error", (self._graph_rows,), "f8", "m, rad", "rows of the task"),
             Field("error_norm", (), "f8", "", "norm of the rows; of a pose Chandra eq. (17)"),
-            STEP_SIZE.of(self.robot, "largest actuator change of this step"),
+            STEP_SIZE.for_robot(self.robot, "largest actuator change of this step"),
             Field("sigma_task", (), "f4", "", "smallest singular value of the scaled Jacobian"),
             *coupling_fields(self.robot),
-            LIMIT_MASK.of(self.robot),
-            STATUS.of(self.robot),
+            LIMIT_MASK.for_robot(self.robot),
+            STATUS.for_robot(self.robot),
         )
 
     @cached_property

@@ -89,7 +89,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
         measured = (
             Field("palm_error", (), "f4", "rad", "palm orientation task error (phase 1)"),
             Field("palm_motion", (2,), "f4", "mm, rad", "palm motion demanded (phase 2)"),
-            STEP_SIZE.of(robot, "largest motor change of this iteration"),
+            STEP_SIZE.for_robot(robot, "largest motor change of this iteration"),
             Field("sigma_thumb", (), "f4", "m", "smallest singular value, thumb point Jacobian"),
             Field("sigma_palm", (), "f4", "", "smallest singular value, palm task (phase 1)"),
             Field("sigma_closed_chain", (), "f4", "", "smallest singular value of H_p (phase 2)"),
@@ -354,7 +354,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
             Field("longest_error", unit="mm"),
             Field("widest_error", unit="rad"),
         )
-        step_size = STEP_SIZE.of(robot, "largest motor change of this iteration")
+        step_size = STEP_SIZE.for_robot(robot, "largest motor change of this iteration")
         super().__init__(robot, options, (), numbers, (step_size,))
 
     def _iteration(self) -> ca.Function:

@@ -224,7 +224,7 @@ class QiuStep(Generic[Options]):
         self.state = Layout((Field("q", (len(robot.actuators),)), *state))
         self.parameters = Layout((*target_fields(robot), limits, *numbers))
         first, last = (Q, POSITION_ERROR, ANGLE_ERROR), (LIMIT_MASK, PHASE, STATUS)
-        fields_of_robot = [[field.of(robot) for field in fields] for fields in (first, last)]
+        fields_of_robot = [[field.for_robot(robot) for field in fields] for fields in (first, last)]
         self.record = Layout.record(*fields_of_robot[0], *measured, *fields_of_robot[1])
 
     def graph(self) -> StepGraph:

@@ -90,7 +90,7 @@ class Searches:
             ctypes.c_int64.from_address(self._base + offsets[name][1])
             for name in ("max_restarts", "iterations", "restarts", "status", "paused")
         )
-        self._beyond = ctypes.c_double.from_address(self._base + offsets["beyond"][1])
+        self._limit_violation = ctypes.c_double.from_address(self._base + offsets["beyond"][1])
 
     def _allocate_side(self, plan: SearchPlan, side: int) -> tuple[Any, ...]:
         """Allocate the seed searches of a side, one for each search of the multi-arm robot."""
@@ -159,7 +159,7 @@ class Searches:
             errors = (
                 self.position_error.tolist(),
                 self.angle_error.tolist(),
-                self._beyond.value,
+                self._limit_violation.value,
             )
         return construct_unchecked(
             SingleOutcome,

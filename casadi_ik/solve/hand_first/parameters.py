@@ -56,7 +56,7 @@ class HandFirstParameters:
             in a flat valley.
         nearly_fits: Cost (0.3 mm, 3 mrad) below which every second global restart starts from the
             incumbent, and the others use hands on the line through the last two incumbents. Three
-            parallel fingers meet their contacts within micrometres along such a line, of which the
+            parallel fingers meet their contacts within micrometres along such a line; the
             arm can reach one end only. Source: of 8,800 targets around 44 of a KUKA LWR with a
             Barrett hand that the search had missed at 1e-6, 1,284 are missed without such lines,
             368 with them.

@@ -311,19 +311,21 @@ class HandFirstLayouts:
         """Layout of the logged row of an iteration."""
         robot = self.robot
         return Layout.record(
-            Q.of(robot, "actuator positions before the step; where the arm is placed, after it"),
-            COST.of(robot, "squared residual before the step"),
-            POSITION_ERROR.of(robot),
-            ANGLE_ERROR.of(robot),
-            DAMPING.of(robot, "Levenberg-Marquardt damping of the step"),
-            STEP_SIZE.of(robot, "largest motor change of the step tried"),
+            Q.for_robot(
+                robot, "actuator positions before the step; where the arm is placed, after it"
+            ),
+            COST.for_robot(robot, "squared residual before the step"),
+            POSITION_ERROR.for_robot(robot),
+            ANGLE_ERROR.for_robot(robot),
+            DAMPING.for_robot(robot, "Levenberg-Marquardt damping of the step"),
+            STEP_SIZE.for_robot(robot, "largest motor change of the step tried"),
             Field("margin", (), "f4", "", "best arm margin found (arm placement)"),
             *coupling_fields(robot),
-            LIMIT_MASK.of(robot),
-            RESTART.of(robot, "hand posture started from, counted from 0"),
-            ACCEPTED.of(robot),
-            PHASE.of(robot),
-            STATUS.of(robot),
+            LIMIT_MASK.for_robot(robot),
+            RESTART.for_robot(robot, "hand posture started from, counted from 0"),
+            ACCEPTED.for_robot(robot),
+            PHASE.for_robot(robot),
+            STATUS.for_robot(robot),
         )
 
     def hand_bounds(self, q: Expr, p: dict[str, Expr], first: int) -> BoxBounds:

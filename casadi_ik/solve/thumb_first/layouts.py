@@ -116,18 +116,18 @@ class ThumbFirstLayouts:
         """Log record of an iteration: its step, and the configuration after it."""
         robot = self.robot
         return Layout.record(
-            Q.of(robot, "actuator positions after the iteration"),
-            COST.of(robot, "summed squares of all contacts there (0.1 m, rad)"),
-            POSITION_ERROR.of(robot),
-            ANGLE_ERROR.of(robot),
-            DAMPING.of(robot, "damping of the step tried"),
-            STEP_SIZE.of(robot, "largest motor change of the step tried"),
-            ACTIVE_MASK.of(robot),
-            LIMIT_MASK.of(robot),
-            RESTART.of(robot, "number of the palm estimate begun from, counted from 0"),
-            ACCEPTED.of(robot),
-            PHASE.of(robot),
-            STATUS.of(robot),
+            Q.for_robot(robot, "actuator positions after the iteration"),
+            COST.for_robot(robot, "summed squares of all contacts there (0.1 m, rad)"),
+            POSITION_ERROR.for_robot(robot),
+            ANGLE_ERROR.for_robot(robot),
+            DAMPING.for_robot(robot, "damping of the step tried"),
+            STEP_SIZE.for_robot(robot, "largest motor change of the step tried"),
+            ACTIVE_MASK.for_robot(robot),
+            LIMIT_MASK.for_robot(robot),
+            RESTART.for_robot(robot, "number of the palm estimate begun from, counted from 0"),
+            ACCEPTED.for_robot(robot),
+            PHASE.for_robot(robot),
+            STATUS.for_robot(robot),
         )
 
     def next_state(
@@ -172,7 +172,7 @@ class ThumbFirstLayouts:
             "angle_error": ca.if_else(p["weights"][:, 1] > 0, errors.angles, ABSENT),
             "damping": ABSENT,
             "step_size": ABSENT,
-            "active_mask": ca.DM.zeros(LIMIT_MASK.of(self.robot).size, 1),
+            "active_mask": ca.DM.zeros(LIMIT_MASK.for_robot(self.robot).size, 1),
             "limit_mask": pack_bits(ca.logic_or(q <= p["lower"], q >= p["upper"])),
             "restart": ca.fmax(s["start"], 0.0),
             "accepted": 0.0,
