@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from collision_queries import query_at
 
 import casadi_ik as ik
 from casadi_ik.collision.clearance import SceneCheck
@@ -24,7 +25,7 @@ def hands(robot, solver):
     """Hands in reach, where the arms stand, and what they are checked against."""
     rng = np.random.default_rng(5)
     q = robot.random(rng, 60)
-    around = solver._engine.collision_query(solver._request.of_arrays(*robot.contacts(q), None))
+    around = query_at(solver, q)
     clearance = around.hand_pairs.check(q).surplus
     free_rows = np.flatnonzero(clearance >= 0)
     return (

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from capsule_arm import SCENE, write_robot
 from coal_oracle import described, distance, in_scene
+from collision_queries import query_at
 
 import casadi_ik as ik
-from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
+from casadi_ik.collision.clearance import CollisionQuery
 from casadi_ik.collision.distances import levers
 
 MICROMETRE = 1e-6
@@ -20,11 +21,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
 
 
 def surroundings(robot: ik.ArmHand, scene: ik.Scene, compiled: bool = True) -> CollisionQuery:
-    check = SceneCheck(robot, scene, compiled)
-    points, normals = robot.contacts(robot.home)
-    return check.collision_query(
-        ik.Solver(robot)._request.of_arrays(points[None], normals[None], None)
-    )
+    return query_at(ik.Solver(robot, scene=scene, compiled=compiled), robot.home)
 
 
 def by_coal(robot: ik.ArmHand, q: np.ndarray, names: set[frozenset[str]]) -> np.ndarray:

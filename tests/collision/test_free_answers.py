@@ -6,6 +6,7 @@ import pickle
 
 import numpy as np
 import pytest
+from collision_queries import query_of_grasps
 
 import casadi_ik as ik
 
@@ -35,8 +36,7 @@ def test_choice_finds_candidates_that_contacts_alone_miss(solver, robot):
     blind = ik.Solver(robot)
     touching = 0
     for grasp in grasps:
-        problems = solver._request.of_grasps([grasp], None)
-        around = solver._engine.collision_query(problems)
+        around = query_of_grasps(solver, [grasp])
         touching += not around.check(blind.solve(grasp).q[None]).free[0]
     assert touching >= 3
 
@@ -71,7 +71,7 @@ def test_without_a_scene_no_collision_is_checked(robot):
 
 def test_grasped_object_may_only_touch_the_fingers(solver):
     cup = ik.load_grasp("cup")
-    around = solver._engine.collision_query(solver._request.of_grasps([cup], None))
+    around = query_of_grasps(solver, [cup])
     of_cup = {names[0] for names in around.table.names if names[1] == "cup"}
     assert "bh_base" in of_cup
     assert "bh_thumb_link_2" in of_cup
@@ -115,7 +115,7 @@ def test_batches_match_single_solves(solver, robot):
 def test_wrong_number_of_object_poses_is_refused(solver):
     """The driver reads as many poses as there are configurations."""
     cup = ik.load_grasp("cup")
-    around = solver._engine.collision_query(solver._request.of_grasps([cup, cup], None))
+    around = query_of_grasps(solver, [cup, cup])
     with pytest.raises(ik.errors.InputError, match="2 poses for 3 configurations"):
         around.check(np.tile(solver.robot.home, (3, 1)))
     assert around.check(np.tile(solver.robot.home, (2, 1))).free.shape == (2,)
@@ -125,7 +125,7 @@ def test_all_solutions_are_collision_free(solver):
     cup = ik.load_grasp("cup")
     solutions = solver.solve_all(cup, limit=4)
     assert solutions
-    around = solver._engine.collision_query(solver._request.of_grasps([cup], None))
+    around = query_of_grasps(solver, [cup])
     assert around.free(np.stack([solution.q for solution in solutions])).all()
 
 

@@ -270,13 +270,10 @@ def test_bad_cloud_arrays_and_keys_are_refused(tmp_path):
         np.lib.format.write_array(stream, np.zeros((11_000_000, 3)))
     points = np.zeros((2, 3))
     for extra, message in (
-        (
-            {"points": np.zeros((2, 2))},
-            r"found float64 of shape \(2, 2\), expected numbers",
-        ),
+        ({"points": np.zeros((2, 2))}, r"points.* \(2, 2\)"),
         ({"points": np.full((2, 3), "a")}, "expected numbers"),
         ({"points": np.full((2, 3), np.nan)}, "found no points"),
-        ({}, "expected a point cloud's file or its points"),
+        ({}, "points"),
         ({"points": points, "file": "a.npy"}, "points"),
         ({"points": points, "voxel": -1}, "voxel: found -1, expected >= 0"),
         ({"points": points, "radius": 0}, "radius: found 0, expected > 0"),

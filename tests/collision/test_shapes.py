@@ -11,6 +11,7 @@ import pytest
 import trimesh
 import yaml
 from capsule_arm import ARM, write_robot
+from collision_queries import query_at
 from scipy.spatial import KDTree
 
 import casadi_ik as ik
@@ -197,9 +198,8 @@ def test_shipped_robots_are_collision_free_at_home(name):
     """At home no two links touch that are checked: the shapes are not too large to be of use."""
     robot = ik.load_robot(name)
     check = SceneCheck(robot, ik.Scene(), compiled=False)
-    points, normals = robot.contacts(robot.home)
-    batch = ik.Solver(robot, compiled=False)._request.of_arrays(points[None], normals[None], None)
-    verdict = check.collision_query(batch).check(robot.home[None])
+    solver = ik.Solver(robot, scene=ik.Scene(), compiled=False)
+    verdict = query_at(solver, robot.home).check(robot.home[None])
     assert verdict.free[0], verdict.pair(0)
     assert all(pair.reason for pair in check.model.excluded)
 

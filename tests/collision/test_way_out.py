@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from collision_queries import query_of_grasps
 
 import casadi_ik as ik
 from casadi_ik.collision.distances import gaps
@@ -58,9 +59,7 @@ def test_margins_of_single_pairs(robot) -> None:
     for margins, expected_margin in (((), 0.03), (smaller_margins, 0.002)):
         scene = ik.Scene({"post": post}, margin=0.01, margins=margins)
         solver = ik.Solver(robot, scene=scene, compiled=False)
-        around = solver._engine.collision_query(
-            solver._request.of_grasps([ik.load_grasp("cup")], None)
-        )
+        around = query_of_grasps(solver, [ik.load_grasp("cup")])
         of_pair = np.array([set(names) == {"lwr_link_6", "post"} for names in around.table.names])
         verdict = around.with_table(around.table.select(of_pair)).check(robot.home[None])
         clearances.append(float(verdict.distance[0]))

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from bench_view import NO_PAINTING
 from browser import Browser, Page
+from collision_queries import query_of_contacts
 
 import casadi_ik as ik
 from casadi_ik.collision.clearance_kernel import ClearanceKernel
@@ -221,9 +222,7 @@ def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
         box = {"kind": "box", "size": post["size"], "xyz": post["pose"][9:]}
         scene = ik.Scene({"apple": ball, "post": box}, grasped="apple")
         solver, points = ik.Solver(robot, scene=scene), joint_positions(page)[None]
-        problems = solver._request.of_arrays(points, np.full_like(points, np.nan), None)
-        around = solver._engine.collision_query(problems)
-        assert around is not None
+        around = query_of_contacts(solver, points, np.full_like(points, np.nan))
         q = np.array(page.evaluate("[...casadiIk.now.answer.q]"))
         clear = around.check(q[None])
         assert current(page, "answer.clearance") == pytest.approx(

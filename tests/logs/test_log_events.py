@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from collision_queries import query_of_contacts
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_solves import (
@@ -337,9 +338,7 @@ def test_a_log_with_a_scene(robot, tmp_path: Path) -> None:
     named = [(record["closest_first"], record["closest_second"]) for record in solves.records()]
     assert named == list(batch.closest)
     # Every iteration's is that of its q with its own object's pose.
-    around = solver._engine.collision_query(
-        solver._request.of_arrays(points, normals, None).holding("cup", poses)
-    )
+    around = query_of_contacts(solver, points, normals, ("cup", poses))
     expected = around.rows(rows.solve_id).check(np.ascontiguousarray(rows.rows["q"]))
     np.testing.assert_allclose(
         rows.rows["clearance"], expected.surplus + scene.margin, atol=1e-6, equal_nan=True

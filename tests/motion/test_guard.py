@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from collision_queries import query_at, query_of_contacts, query_of_grasps
 from dense_ways import dense
 from samplers import smooth_path
 from toy_robots import grasp_of, grasps_of
@@ -20,10 +21,7 @@ def solver(robot) -> ik.Solver:
 
 
 def clearances(solver, q):
-    problems = solver._request.of_arrays(*solver.robot.contacts(q[:1]), None)
-    around = solver._engine.collision_query(problems)
-    assert around is not None
-    return around.check(q)
+    return query_at(solver, q[:1]).check(q)
 
 
 def test_targets_inside_a_table_are_not_followed(robot, solver):
@@ -155,8 +153,7 @@ def test_passing_thumbs_keep_apart_in_every_cycle():
 
 def clearances_around(solver):
     grasp = ik.Grasp(dict.fromkeys(solver.robot.fingers[:1], ik.Contact([0, 0, 0], [0, 0, 1])))
-    around = solver._engine.collision_query(solver._request.of_grasps([grasp], None))
-    return around.rows(np.zeros(1, dtype=np.intp))
+    return query_of_grasps(solver, [grasp]).rows(np.zeros(1, dtype=np.intp))
 
 
 def test_a_path_keeps_clear(robot, solver):
@@ -198,8 +195,7 @@ def test_obstacle_between_free_postures_is_detected(robot):
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[x, y - 0.5, z], [x, y + 0.5, z]]
     carrying = ik.Solver(robot, scene=scene_in_hand)
-    problems = carrying._request.of_arrays(*robot.contacts(q_path[:2]), None)
-    moving = carrying._engine.collision_query(problems.holding("ball", poses))
+    moving = query_of_contacts(carrying, *robot.contacts(q_path[:2]), ("ball", poses))
     standing = np.tile(robot.home, (2, 1))
     assert moving.free(standing).all()
     assert not check_path(moving, standing).free[0]

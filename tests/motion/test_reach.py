@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from collision_queries import query_at, query_of_grasps
 from dense_ways import dense
 
 import casadi_ik as ik
@@ -132,8 +133,7 @@ def test_path_leads_around_an_obstacle(robot):
     place = robot.palm(ends.mean(axis=0))[:3, 3]
     solids = {"ball": {"kind": "sphere", "radius": 0.05, "xyz": place.tolist()}}
     solver = ik.Solver(robot, scene=ik.Scene(solids))
-    problem = solver._request.of_arrays(*robot.contacts(ends[1:]), None)
-    around = solver._engine.collision_query(problem).rows(np.zeros(1, dtype=int))
+    around = query_at(solver, ends[1:]).rows(np.zeros(1, dtype=int))
     assert not around.free(dense(ends, motor_units(robot))).all()
     corners, reason = plan_path(robot, *ends, around, seed=0)
     assert "OMPL" in reason
@@ -147,8 +147,7 @@ def test_whole_motion_is_collision_free(robot, grasp):
     solver = ik.Solver(robot, scene=ik.load_scene("table"))
     motion = solver.reach(grasp)
     part = check_motion(robot, grasp, motion, robot.home)
-    problem = solver._request.of_grasps([grasp], None)
-    around = solver._engine.collision_query(problem).rows(np.zeros(1, dtype=int))
+    around = query_of_grasps(solver, [grasp]).rows(np.zeros(1, dtype=int))
     looked_at = dense(motion.motion.q[part != "closing"], motor_units(robot))
     assert around.free(looked_at).all()
     assert motion.clearance >= 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from collision_queries import query_at
 from excursions import excursion
 
 import casadi_ik as ik
@@ -19,8 +20,7 @@ def free_starts(robot, count):
 
 
 def clearances(solver, q):
-    problems = solver._request.of_arrays(*solver.robot.contacts(q[:1]), None)
-    return solver._engine.collision_query(problems).check(q)
+    return query_at(solver, q[:1]).check(q)
 
 
 @pytest.mark.parametrize("kind", ["out", "turn"])

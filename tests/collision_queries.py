@@ -1,0 +1,38 @@
+"""Collision queries of a solver with a scene, as its engine makes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+import casadi_ik as ik
+from casadi_ik.collision.clearance import CollisionQuery
+from casadi_ik.files.arrays import Array
+
+
+def query_of_grasps(solver: ik.Solver, grasps: Sequence[ik.Grasp]) -> CollisionQuery:
+    """Return the collision query about the targets of grasps."""
+    return _query(solver, solver._request.of_grasps(grasps, None))
+
+
+def query_of_contacts(
+    solver: ik.Solver,
+    points: Array,
+    normals: Array,
+    held: tuple[str, Array] | None = None,
+) -> CollisionQuery:
+    """Return the collision query about contacts (k, f, 3); `held`: object and poses (k, 4, 4)."""
+    targets = solver._request.of_arrays(points, normals, None)
+    return _query(solver, targets if held is None else targets.holding(*held))
+
+
+def query_at(solver: ik.Solver, q: Array) -> CollisionQuery:
+    """Return the collision query about the contacts of configurations (k, n)."""
+    return query_of_contacts(solver, *solver.robot.contacts(np.atleast_2d(q)))
+
+
+def _query(solver: ik.Solver, targets: object) -> CollisionQuery:
+    query = solver._engine.collision_query(targets)  # type: ignore[arg-type]
+    assert query is not None
+    return query
