@@ -21,6 +21,7 @@ from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.compile.loop import LoopKernel
 from casadi_ik.files.arrays import Array, Rows
 from casadi_ik.kinematics.box_qp import normal_equations, solve_box_qp
+from casadi_ik.kinematics.contact_curvature import residual_curvature
 from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
 from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix
 from casadi_ik.kinematics.forward import motor_scales
@@ -150,7 +151,7 @@ class DescentStep:
         # Structural zeros between motors of different fingers shorten the elimination.
         jacobian = contact_jacobian(self.robot, self.contacts, q, p)
         gauss_newton, gradient = normal_equations(jacobian, residual)
-        hessian = ca.project(ca.hessian(distance, q)[0], gauss_newton.sparsity())
+        hessian = gauss_newton + residual_curvature(self.robot, self.contacts, q, p, residual)
         inputs = [q, parameters]
         value = ca.Function("distance", inputs, [distance])
         model = ca.Function("model", inputs, with_cse(distance, gradient, gauss_newton, hessian))
