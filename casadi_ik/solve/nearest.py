@@ -80,13 +80,13 @@ class DescentParameters:
         max_iterations: Maximum number of steps.
     """
 
-    damping: float = 1e-3
+    damping: float = 0.3
     damping_floor: float = 1e-12
     damping_ceiling: float = 1e6
     decrease: float = 0.1
     increase: float = 8.0
     slow: float = 0.5
-    settled: float = 1e-14
+    settled: float = 1e-11
     local_step: float = 0.1
     passes: int = 3
     max_iterations: int = 200
@@ -165,8 +165,13 @@ class DescentStep:
         trial = ca.fmin(ca.fmax(trial, p["lower"]), p["upper"])
         distance_after = value(trial, parameters)
         is_accepted = distance_after < distance_before
+        change = trial - s["q"]
+        symmetric = matrix + ca.triu(matrix, False).T
+        predicted = -ca.dot(change, slope + symmetric @ change / 2)
+        gain = (distance_before - distance_after) / ca.fmax(predicted, 1e-300)
         is_slow = distance_after > DESCENT.slow * distance_before
-        factor = ca.if_else(is_accepted, DESCENT.decrease, DESCENT.increase)
+        factor = ca.if_else(gain > 0.75, DESCENT.decrease, ca.if_else(gain > 0.25, 0.5, 2.0))
+        factor = ca.if_else(is_accepted, factor, DESCENT.increase)
         new_state = {
             "q": ca.if_else(is_accepted, trial, s["q"]),
             "damping": ca.fmax(s["damping"] * factor, DESCENT.damping_floor),
