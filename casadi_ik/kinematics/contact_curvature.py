@@ -89,7 +89,9 @@ def _vector_derivatives(
     curvatures = [
         ca.sparsify(ca.jacobian(slope, tip)) for slope, tip in zip(slopes, stacked, strict=True)
     ]
-    results = ca.substitute([*slopes, *curvatures], [*stacked, factors], [*values, ca.densify(residual)])
+    results = ca.substitute(
+        [*slopes, *curvatures], [*stacked, factors], [*values, ca.densify(residual)]
+    )
     return results[: len(tips)], results[len(tips) :]
 
 

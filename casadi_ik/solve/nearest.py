@@ -69,8 +69,12 @@ class DescentParameters:
         damping: First damping of the normal matrix.
         damping_floor: Smallest damping.
         damping_ceiling: Damping at which a rejected step ends the descent.
-        decrease: Factor of the damping after an accepted step.
-        increase: Factor of the damping after a rejected step.
+        good_gain: Ratio of actual and predicted decrease above which the damping decreases most.
+        poor_gain: Ratio below which the damping increases after an accepted step.
+        good_factor: Factor of the damping after a step with a good gain.
+        fair_factor: Factor of the damping after a step between the two ratios.
+        poor_factor: Factor of the damping after an accepted step with a poor gain.
+        rejected_factor: Factor of the damping after a rejected step.
         slow: Ratio of distances after and before a step above which steps use the exact second
             derivatives: Gauss-Newton steps converge slowly where errors remain.
         settled: Relative decrease of the distance below which a descent has ended.
@@ -80,15 +84,19 @@ class DescentParameters:
         max_iterations: Maximum number of steps.
     """
 
-    damping: float = 0.3
+    damping: float = 1.0
     damping_floor: float = 1e-12
     damping_ceiling: float = 1e6
-    decrease: float = 0.1
-    increase: float = 8.0
+    good_gain: float = 0.75
+    poor_gain: float = 0.25
+    good_factor: float = 0.2
+    fair_factor: float = 0.7
+    poor_factor: float = 3.0
+    rejected_factor: float = 8.0
     slow: float = 0.5
     settled: float = 1e-11
     local_step: float = 0.1
-    passes: int = 3
+    passes: int = 2
     max_iterations: int = 200
 
 
@@ -167,18 +175,22 @@ class DescentStep:
         is_accepted = distance_after < distance_before
         change = trial - s["q"]
         symmetric = matrix + ca.triu(matrix, False).T
-        predicted = -ca.dot(change, slope + symmetric @ change / 2)
-        gain = (distance_before - distance_after) / ca.fmax(predicted, 1e-300)
+        predicted_decrease = -ca.dot(change, slope + symmetric @ change / 2)
+        decrease = distance_before - distance_after
         is_slow = distance_after > DESCENT.slow * distance_before
-        factor = ca.if_else(gain > 0.75, DESCENT.decrease, ca.if_else(gain > 0.25, 0.5, 2.0))
-        factor = ca.if_else(is_accepted, factor, DESCENT.increase)
+        factor = DESCENT.poor_factor
+        for gain, gain_factor in (
+            (DESCENT.poor_gain, DESCENT.fair_factor),
+            (DESCENT.good_gain, DESCENT.good_factor),
+        ):
+            factor = ca.if_else(decrease > gain * predicted_decrease, gain_factor, factor)
+        factor = ca.if_else(is_accepted, factor, DESCENT.rejected_factor)
         new_state = {
             "q": ca.if_else(is_accepted, trial, s["q"]),
             "damping": ca.fmax(s["damping"] * factor, DESCENT.damping_floor),
-            "is_exact": ca.if_else(is_accepted, is_slow, 1 - s["is_exact"]),
+            "is_exact": ca.if_else(is_accepted, is_slow, s["is_exact"]),
             "distance": ca.if_else(is_accepted, distance_after, distance_before),
         }
-        decrease = distance_before - distance_after
         has_settled = ca.logic_and(is_accepted, decrease <= DESCENT.settled * distance_before)
         is_stuck = ca.logic_and(ca.logic_not(is_accepted), s["damping"] > DESCENT.damping_ceiling)
         status = ca.if_else(
