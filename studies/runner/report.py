@@ -105,10 +105,30 @@ def write_metrics(metrics: Iterable[Metric], path: Path) -> None:
     path.write_text(f"[\n {lines}\n]\n", encoding="utf-8")
 
 
+MAX_COLUMNS = 8
+"""Columns of a table; a wider one is divided."""
+
+
 def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table with the first column left-aligned and the others right-aligned."""
-    lines = [heads, ["---", *["---:"] * (len(heads) - 1)], *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    """Return a table with the first column left-aligned and the others right-aligned.
+
+    A table of more than `MAX_COLUMNS` becomes several that repeat the columns that identify a row.
+    """
+    return "\n".join(
+        "".join(f"| {' | '.join(line[i] for i in columns)} |\n" for line in (heads, rule, *rows))
+        for columns in column_groups(rows, len(heads))
+        for rule in [["---", *["---:"] * (len(heads) - 1)]]
+    )
+
+
+def column_groups(rows: Sequence[Sequence[str]], count: int) -> list[list[int]]:
+    """Divide the columns of a table into groups that start with the columns that identify a row."""
+    if count <= MAX_COLUMNS:
+        return [list(range(count))]
+    identified = (k for k in range(1, 5) if len({tuple(row[:k]) for row in rows}) == len(rows))
+    keys = next(identified, 1)
+    groups = np.array_split(np.arange(keys, count), -(-(count - keys) // (MAX_COLUMNS - keys)))
+    return [[*range(keys), *group.tolist()] for group in groups]
 
 
 def write_page(title: str, parts: Sequence[str], folder: Path) -> None:

@@ -39,7 +39,7 @@ def first(pattern: str, text: str) -> str:
 
 
 def missed_targets() -> str:
-    return first(r"\| missed, 5 mm, 3 deg \| 0 \| (0 of [\d,]+) \|", report("any_robot"))
+    return first(r"\| missed, 5 mm, 3 deg \| (0 of [\d,]+) \|", report("any_robot"))
 
 
 def collision_free() -> str:
@@ -54,8 +54,8 @@ def batch_time() -> str:
 
 
 def noise() -> str:
-    row = first(r"\| 4 mm, 2 deg \|(.*?)\| 5 mm", report("noise"))
-    return f"{float(row.split('|')[5]):.1f}"
+    table = report("noise").partition("(now)")[2]
+    return f"{float(first(r'[|] 4 mm, 2 deg [|] ([0-9.]+) [|]', table)):.1f}"
 
 
 PROOFS = r"(?:False proofs of UNREACHABLE \| 0 of|None of) ([\d,]+)"

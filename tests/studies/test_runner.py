@@ -20,7 +20,13 @@ import small_study
 from dask_processes import scheduler_process, worker_process
 from distributed.versions import get_versions
 from processes import POSIX, python
-from runner.report import interval_text, mean_metric, median_metric, rate_metric
+from runner.report import (
+    interval_text,
+    markdown_table,
+    mean_metric,
+    median_metric,
+    rate_metric,
+)
 from runner.study import STUDY_FILE, claim, missing, read_results, run
 
 import casadi_ik as ik
@@ -248,3 +254,13 @@ def test_means_and_medians(rng):
     assert mean_metric("x", [-1.0, 0.0, 9.0], "ms").low < -1
     assert interval_text(mean_metric("x", [], "ms")) == "-"
     assert interval_text(mean_metric("x", [2.0], "ms")) == "2.0"
+
+
+def test_wide_tables_are_divided_and_repeat_the_keys():
+    rows = [["a", "x", *"123456789"], ["a", "y", *"123456789"]]
+    text = markdown_table(list("ABcdefghijk"), rows)
+    tables = [block.splitlines() for block in text.strip().split("\n\n")]
+    heads = ["| A | B | c | d | e | f | g |", "| A | B | h | i | j | k |"]
+    assert [table[0] for table in tables] == heads
+    assert all(len(table) == 4 for table in tables)
+    assert markdown_table(list("ABCDEFGH"), []).count("\n") == 2
