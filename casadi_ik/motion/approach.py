@@ -1,4 +1,4 @@
-"""Straight approaches to grasps, planned backwards: the hand opens, and moves straight back."""
+"""Straight approaches to grasps, planned backwards from the grasp."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import point_normal_kinds
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.cycle import side_name
-from casadi_ik.motion.free_path import least_clearance
+from casadi_ik.motion.free_path import minimum_clearance
 from casadi_ik.motion.inputs import UNUSED_NORMAL, FollowerInputs, FollowPlan
 
 
@@ -42,7 +42,7 @@ class ApproachFinder:
     Attributes:
         postures: Number of postures of each of the two parts.
         cycles: Cycles of the follower's graph per posture.
-        max_deviation: Largest deviation of the palm from the straight line [m].
+        max_deviation: Maximum deviation of the palm from the straight line [m].
     """
 
     postures = 40
@@ -136,7 +136,7 @@ class ApproachFinder:
 
 
 def hands_used(robot: ArmHand, problem: TargetBatch) -> Array:
-    """Return (f, 1): 1 for fingers of a hand with a contact; 0 for those of a hand that rests."""
+    """Return (f, 1): 1 for all fingers of a hand with a contact, 0 for those of a hand without."""
     has_contact, is_used = ~np.isnan(problem.points[0, :, 0]), np.zeros((len(robot.fingers), 1))
     for hand in map(list, robot.hands.values()):
         is_used[hand] = has_contact[hand].any()
@@ -144,15 +144,15 @@ def hands_used(robot: ArmHand, problem: TargetBatch) -> Array:
 
 
 TILT = float(np.tan(np.deg2rad(35.0)))
-"""Tangent of the tilt of the approach directions that are tried last."""
+"""Tangent of the tilt of the last alternative approach directions."""
 
-OPENING_SHARES = np.array([1.0, 0.5, 0.25])
-"""Shares of the requested opening that are tried: the hand or a table may not permit all of it."""
+OPENING_FRACTIONS = np.array([1.0, 0.5, 0.25])
+"""Fractions of the requested opening, in the order of preference."""
 
 MAX_PAD_PENETRATION = 1e-3
-"""Largest penetration of a pad into the object before the hand closes [m].
+"""Maximum penetration of a pad into the object before the hand closes [m].
 
-It equals a typical position tolerance of a contact.
+The value equals a typical position tolerance of a contact.
 """
 
 
@@ -171,9 +171,9 @@ class ReachStatus(Enum):
     REACHED = "reached"
     """There is a motion; with a scene it is free of collisions."""
     NOT_SOLVED = "not solved"
-    """The grasp has no solution; `Solver.solve` tells why."""
+    """The grasp has no solution; `Solver.solve` returns the reason."""
     NO_APPROACH = "no approach"
-    """The open hand can retreat straight from none of the solutions without a collision."""
+    """The open hand collides on every straight approach to a solution."""
     NO_RETREAT = "no retreat"
     """The hand with the object cannot be lifted or retreat as requested."""
     NO_WAY = "no way"
@@ -191,8 +191,8 @@ class Approach(RecordReprMixin):
         coming: (k, n) postures of the straight motion from the pre-grasp with open fingers; None on
             failure.
         closing: (k, n) postures while the hand closes, up to the grasp; None on failure.
-        clearance: Smallest distance before the hand closes [m]; None without a scene.
-        tried: Number of solutions of the grasp that were tried.
+        clearance: Minimum clearance before the hand closes [m]; None without a scene.
+        tried: Number of attempted solutions of the grasp.
 
     Example:
         >>> found = solver.approach(grasp, distance=0.1)
@@ -264,7 +264,7 @@ class ApproachPlan:
         first = tips.mean(axis=0) - palm[:3, 3] if len(tips) else down
         if self.pregrasp is not None:
             line = palm[:3, 3] - self.pregrasp
-            # A pre-grasp very near to the grasp does not define a direction.
+            # A pre-grasp that nearly coincides with the grasp does not define a direction.
             first = line if np.linalg.norm(line) > 5e-3 else first
         first = _unit(first)
         sides = [sign * palm[:3, axis] for axis in (0, 1) for sign in (1.0, -1.0)]
@@ -286,7 +286,7 @@ class ApproachAttempt:
         reason: Reason of a failure, "" on success.
         open_query: Collision checks before the hand closes; None checks nothing.
         closing_query: Collision checks while it closes; None checks nothing.
-        coming_query: Collision checks of the straight motion: one of these two.
+        coming_query: Collision checks of the straight motion: `open_query` or `closing_query`.
     """
 
     finder: ApproachFinder
@@ -306,7 +306,7 @@ def approaches(plan: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Appro
     for number, q in enumerate(solutions, start=1):
         blocked_opening = -1.0
         path, reason, coming_query = None, "", open_query
-        for opening, directions in product(plan.opening * OPENING_SHARES, plan.directions(q)):
+        for opening, directions in product(plan.opening * OPENING_FRACTIONS, plan.directions(q)):
             if blocked_opening == opening:
                 continue
             path = finder.find(plan.problem, q, opening, plan.distance, directions)
@@ -341,7 +341,7 @@ def approach(plan: ApproachPlan, solutions: Sequence[Array], reason: str) -> App
             continue
         clearance = None
         if attempt.coming_query is not None:
-            clearance, _ = least_clearance(attempt.coming_query, path.coming)
+            clearance, _ = minimum_clearance(attempt.coming_query, path.coming)
         postures = attempt.q, path.coming, path.closing
         return Approach(ReachStatus.REACHED, "", *postures, clearance, attempt.number)
     count = len(solutions)
@@ -349,7 +349,7 @@ def approach(plan: ApproachPlan, solutions: Sequence[Array], reason: str) -> App
 
 
 def _queries(plan: ApproachPlan) -> tuple[CollisionQuery | None, CollisionQuery | None]:
-    """Return the collision checks while the hand closes, and before it does.
+    """Return the collision checks while the hand closes, and before it closes.
 
     Before the hand closes, the fingers must not touch the object either.
     """
@@ -363,7 +363,7 @@ def _queries(plan: ApproachPlan) -> tuple[CollisionQuery | None, CollisionQuery 
 
 
 CLOSING_PREFIX = "the closing"
-"""First words of the reason if the hand cannot close."""
+"""Prefix of the reason if the hand cannot close."""
 
 
 def _obstruction(
@@ -372,26 +372,26 @@ def _obstruction(
     closing_query: CollisionQuery | None,
     open_query: CollisionQuery | None,
 ) -> tuple[str, CollisionQuery | None]:
-    """Return what obstructs an approach ("" if it is free), and the checks of its straight motion.
+    """Return the obstruction of an approach ("" if free), and the checks of its straight motion.
 
-    Collision shapes of fingers are rounder than the fingers. Where a hand cannot open far enough
-    for them, links with a contact may touch the object if their pads do not penetrate it.
+    Collision shapes of fingers are larger than the fingers. If a hand cannot open far enough for
+    these shapes, links with a contact may touch the object if their pads do not penetrate it.
     """
     if path is None:
         return "the arm cannot follow the straight retreat", open_query
     if closing_query is None or open_query is None:
         return "", None
-    if len(path.closing) > 1 and (contact := least_clearance(closing_query, path.closing)[1]):
+    if len(path.closing) > 1 and (contact := minimum_clearance(closing_query, path.closing)[1]):
         return f"{CLOSING_PREFIX} is not free: {contact}", open_query
     if len(path.coming) < 2:
         return "", open_query
-    _, contact = least_clearance(open_query, path.coming)
+    _, contact = minimum_clearance(open_query, path.coming)
     if not contact:
         return "", open_query
-    pregrasp_is_free = not least_clearance(open_query, path.coming[:1])[1]
+    pregrasp_is_free = not minimum_clearance(open_query, path.coming[:1])[1]
     if (
         pregrasp_is_free
-        and not least_clearance(closing_query, path.coming)[1]
+        and not minimum_clearance(closing_query, path.coming)[1]
         and _pads_are_free(plan, path.coming)
     ):
         return "", closing_query

@@ -4,8 +4,9 @@ The *goal* of the motors is computed by a few Gauss-Newton steps of all motors t
 
     min |r + J s - e|^2 + damping |r|^2 |s|^2 + |clearances|^2 + pull |goal + s - anchor|^2
 
-within bounds. r and J are the residual of the contacts (`ContactRows`) and its Jacobian, and every
-motor counts in its own unit. The steps start at the previous goal, so the goal stays on its branch.
+within bounds. r and J are the residual of the contacts (`ContactRows`) and its Jacobian. Motor
+positions are scaled by the unit of each motor. The steps start at the previous goal, so the goal
+stays on its branch.
 
 While motors can keep up with the contacts they are *locked on* the goal: the bounds are those that
 velocities and accelerations permit, and the anchor continues the momentum of the motors. So free
@@ -30,8 +31,8 @@ of a step from cycle to cycle. A motor with step w whose steps shrink by c in ea
     w + (w - c) + (w - 2 c) + ...
 
 so the longest step from which it can stop within a distance follows in closed form (`brake`). It is
-applied twice: to come to rest at the goal, relative to the goal's motion, and at the limits,
-whatever the goal does. After a step that satisfies the second condition there is another one, so
+applied twice: to stop at the goal, relative to the motion of the goal, and to stop at the limits,
+independently of the goal. After a step that satisfies the second condition there is another one, so
 the bounds below are never empty.
 """
 
@@ -67,18 +68,18 @@ class CycleTuning:
 
     Attributes:
         steps: Number of Gauss-Newton steps.
-        passes: Corrections of the active set of bounds in a step.
-        residual_damping: Damping per squared residual. Where contacts are out of reach the least
+        passes: Number of corrections of the active set of bounds in a step.
+        residual_damping: Damping per squared residual. If contacts are out of reach, the minimum
             residual is not small, and undamped Gauss-Newton steps oscillate about it.
-        max_goal_step: Largest motion of the goal in a cycle [rad, or part of a slider's range],
-            however fast the motor is: a goal that leaps may arrive at another branch.
+        max_goal_step: Maximum motion of the goal in a cycle [rad, or fraction of a slider's range],
+            independently of the speed of the motor: a larger step may change the branch.
         clearance_weight: Weight of a clearance relative to a contact: clearances use free motions
             and hardly move contacts.
-        braking_share: Part of the acceleration limit that motors use to come to rest at the goal;
-            the remainder allows for the motion of the goal.
+        braking_share: Fraction of the acceleration limit that motors use to stop at the goal; the
+            remainder allows for the motion of the goal.
         arrival_distance: Distance from the goal at which a motor has arrived [rad or m].
-        min_change: Steps of the goal below this part of the largest change of a step, or below
-            `arrival_distance`, are omitted, so that the motors come to rest exactly.
+        min_change: Minimum step of the goal, as a fraction of the maximum change of a step. Smaller
+            steps, and steps below `arrival_distance`, are omitted, so that the motors stop exactly.
     """
 
     steps: int = 2
@@ -99,7 +100,7 @@ def brake(distance: Expr, change: Expr) -> Expr:
 
     Args:
         distance: (n, 1) distance >= 0.
-        change: (n, 1) largest change of a step from cycle to cycle, > 0.
+        change: (n, 1) maximum change of a step from cycle to cycle, > 0.
 
     Returns:
         (n, 1) change (u + N (N + 1) / 2) / (N + 1) with u = distance / change and N the number of
@@ -111,7 +112,7 @@ def brake(distance: Expr, change: Expr) -> Expr:
 
 
 def step_bounds(s: dict[str, Expr], p: dict[str, Expr]) -> tuple[Expr, Expr]:
-    """Return the least and the largest step of the motors, (n, 1) each.
+    """Return the minimum and maximum steps of the motors, (n, 1) each.
 
     Args:
         s: State with "q" and "last_step".

@@ -36,14 +36,14 @@ class FollowStatus(Enum):
     """
 
     FOLLOWING = "following"
-    """Every contact is within tolerance."""
+    """The contacts are within tolerance."""
     LATE = "late"
-    """The motors are on their way; velocity and acceleration limits delay them."""
+    """The motors approach the goal; velocity and acceleration limits delay them."""
     MISSED = "missed"
-    """No configuration on this branch meets the contacts: they are out of reach, or beyond a
+    """Configurations on this branch do not meet the contacts: these are out of reach, or beyond a
     limit."""
     BLOCKED = "blocked"
-    """A collision would follow: the motors stop before it."""
+    """The target leads to a collision: the motors stop before it."""
     HOLDING = "holding"
     """The frame is invalid: the motors decelerate to rest and wait for a valid one."""
 
@@ -62,9 +62,9 @@ class FollowState:
         goal: (n,) configuration that the motors track [rad or m].
         goal_position_error: (f,) position errors at the goal [m], NaN where free.
         goal_angle_error: (f,) angle errors at the goal [rad], NaN where free.
-        clearance: Distance of the pair with the least clearance beyond its margin [m]; None without
-            a scene.
-        closest: Names of that pair; None without a scene.
+        clearance: Distance of the pair with the minimum clearance beyond its margin [m]; None
+            without a scene.
+        closest: Names of this pair; None without a scene.
         cycles: Number of cycles so far.
 
     Example:
@@ -92,7 +92,7 @@ class FollowState:
 NO_FRAME = "no frame yet"
 
 IDENTITY = np.eye(4)
-"""Pose that trackers send for a lost hand; no real palm coincides with the base frame."""
+"""Pose that trackers send for a lost hand; a real palm does not coincide with the base frame."""
 
 PALM_WEIGHT = 0.1
 """Default weight of a palm's position and axes relative to a contact."""
@@ -102,10 +102,9 @@ class Follower:
     """Follower of moving contacts, cycle by cycle, within the limits of the motors.
 
     For all targets positions, velocities and accelerations stay within limits, the configuration
-    stays on its branch, and with a scene the robot can always come to rest before it touches
-    anything that stands still. An invalid frame (partly NaN, infinite, a zero normal, no contact)
-    is not an error: the motors come to rest, and continue with the next valid frame. An instance is
-    not thread-safe.
+    stays on its branch, and with a scene the robot can always stop before it touches a static
+    obstacle. An invalid frame (partly NaN, infinite, a zero normal, no contact) is not an error:
+    the motors stop, and continue with the next valid frame. An instance is not thread-safe.
 
     Attributes:
         period: Time from cycle to cycle [s].
@@ -219,10 +218,10 @@ class Follower:
         Args:
             target: Grasp with contacts of any kind; or (f, 3) contact points [m], base frame, in
                 the order of `robot.fingers`, NaN for a free finger.
-            normals: (f, 3) outward pad normals of any length, NaN for a free one; None: all are
+            normals: (f, 3) outward pad normals of any length, NaN for a free normal; None: all are
                 free.
             palm: (4, 4) target pose of the palm, base frame, or poses by side of a multi-arm robot;
-                it counts as far as the contacts permit. None: the palm is free.
+                it has a lower priority than the contacts. None: the palm is free.
             palm_weight: Weights of the palm's position and axes relative to a contact.
 
         Returns:
@@ -231,7 +230,7 @@ class Follower:
         Raises:
             InputError: Wrong shapes, values that are not numeric, or a grasp of another robot.
                 Invalid points, normals and poses of a tracker that has lost the hand are not an
-                error: the motors come to rest, and `FollowState.reason` tells why.
+                error: the motors stop, and `FollowState.reason` has the reason.
         """
         self._cycles += 1
         poses, self._reason = self._poses(palm)
@@ -285,7 +284,7 @@ class Follower:
         palms: Poses,
         palm_weight: tuple[float, float],
     ) -> Array:
-        """Repeat the last step with contacts of which some are free or invalid."""
+        """Repeat the last step with contacts that are partly free or invalid."""
         inputs = self._inputs
         inputs.run.back()
         free = np.full(self._shape, np.nan)

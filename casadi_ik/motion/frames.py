@@ -40,7 +40,7 @@ class Frames:
             hand; empty for a stream of contacts.
         points: (k, f, 3) contact points [m], base frame; f = 0 for a stream of keypoints.
         normals: (k, f, 3) outward pad normals; NaN where free.
-        lost: Reason of every frame that was rejected because the tracker has lost the hand.
+        rejection_reasons: Reason of each rejected frame, in which the tracker has lost the hand.
     """
 
     path: Path
@@ -48,17 +48,17 @@ class Frames:
     keypoints: dict[str | None, Array]
     points: Array
     normals: Array
-    lost: tuple[str, ...] = ()
+    rejection_reasons: tuple[str, ...] = ()
 
     def screened(self, retargeter: Retargeter) -> Frames:
-        """Return the frames with NaN in those of a tracker that has lost the hand."""
+        """Return the frames with NaN where the tracker has lost the hand."""
         if self.keypoints:
             keypoints, reasons = retargeter.screened(self.keypoints, self.times)
-            return replace(self, keypoints=keypoints, lost=tuple(reasons))
+            return replace(self, keypoints=keypoints, rejection_reasons=tuple(reasons))
         reasons = [lost_contacts_reason(frame) for frame in self.points]
         points = self.points.copy()
         points[[i for i, reason in enumerate(reasons) if reason]] = np.nan
-        return replace(self, points=points, lost=tuple(filter(None, reasons)))
+        return replace(self, points=points, rejection_reasons=tuple(filter(None, reasons)))
 
     def interpolate(self, times: Array, values: Array) -> Array:
         """Return values of frames interpolated at other times; NaN next to a frame with NaN."""
@@ -160,9 +160,7 @@ def _times(path: Path, arrays: dict[str, Array], count: int, max_interval: float
     times = arrays.get("times", np.arange(count) / RATE)
     is_finite = times.shape == (count,) and np.isfinite(times).all()
     if not (is_finite and (np.diff(times) > 0).all()):
-        raise InputError(
-            f"{path}: times: expected {count} growing numbers of seconds, one per frame"
-        )
+        raise InputError(f"{path}: times: expected {count} increasing numbers [s], one per frame")
     check_time_unit(times, f"{path}: times", max_interval)
     return times - times[0]
 

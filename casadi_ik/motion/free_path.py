@@ -1,9 +1,9 @@
-"""Paths that are free of collisions: checks between postures, and planning from one to another.
+"""Collision-free paths: checks between postures, and planning of paths.
 
 The distance of two shapes changes by at most as much as they move. Between two postures a pair
 therefore keeps at least half of the sum of its clearances at both ends, less half of its motion in
 between. `check_path` evaluates the middle posture where this bound does not suffice, and then both
-halves. A segment whose ends are free and on which nothing moves by more than `RESOLUTION` counts as
+halves. A segment with free ends on which no shape moves by more than `PATH_RESOLUTION` counts as
 free.
 """
 
@@ -19,8 +19,8 @@ from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.kinematics.arm_hand import ArmHand
 
-RESOLUTION = 1e-4
-"""Motion [m] below which a segment is not divided; clearances may be smaller by half of it."""
+PATH_RESOLUTION = 1e-4
+"""Motion below which a segment is not divided [m]; clearances may be lower by half of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,11 @@ class PathCheck:
 
     Attributes:
         free: (k - 1,) True if a segment is free of collisions.
-        worst: (k - 1, n) posture with the least clearance among those evaluated on each segment.
-        surplus: (k - 1,) its clearance beyond the margin [m]. Other postures of a free segment have
-            less by at most the motion to the next posture that was evaluated.
-        distance: (k - 1,) its clearance, see `Clearances` [m].
-        pairs: (k - 1,) number of its nearest pair, see `Clearances`.
+        worst: (k - 1, n) evaluated posture with the minimum clearance on each segment.
+        surplus: (k - 1,) clearance of this posture beyond the margin [m]. On a free segment other
+            postures have less by at most the motion to the next evaluated posture.
+        distance: (k - 1,) clearance of this posture, see `Clearances` [m].
+        pairs: (k - 1,) index of its nearest pair, see `Clearances`.
     """
 
     free: Bools
@@ -85,7 +85,7 @@ class _Sampler:
     def __init__(self, query: CollisionQuery) -> None:
         self._query, table = query, query.table
         reach = np.array([solid.reach for solid in table.solids])
-        # A half-space may move as well, but no scene rotates it.
+        # A half-space may translate, but scenes do not rotate it.
         bounded_reach = np.where(np.isfinite(reach), reach, 0.0)
         self._robot_reach = bounded_reach[: table.own]
         self._scene_reach = bounded_reach[table.own :]
@@ -104,9 +104,9 @@ class _Sampler:
         return _Samples(q, solid_poses, np.concatenate(shapes), np.concatenate(clearances))
 
     def approach_bound(self, start: _Samples, end: _Samples) -> Array:
-        """Return an upper bound (m,) of how much a clearance changes on each segment [m].
+        """Return upper bounds (m,) of the change of clearances on each segment [m].
 
-        It is twice the largest motion of a shape.
+        The bound is twice the maximum motion of a shape.
         """
         split, count = 6 * self._capsules, len(start.q)
         change = end.shapes - start.shapes
@@ -140,8 +140,8 @@ def check_path(query: CollisionQuery, q: Array, find_minimum: bool = False) -> P
     Args:
         query: Scene at each posture, or one scene for all of them.
         q: (k, n) postures.
-        find_minimum: True to find the least clearance as well: on a free path it is nowhere less
-            than the smallest of `PathCheck.surplus` by more than `RESOLUTION`.
+        find_minimum: True to find the minimum clearance: on a free path the minimum of
+            `PathCheck.surplus` then exceeds the true minimum by at most `PATH_RESOLUTION`.
     """
     count, n = max(len(q) - 1, 0), q.shape[1]
     solid_poses = query.poses
@@ -159,7 +159,7 @@ def check_path(query: CollisionQuery, q: Array, find_minimum: bool = False) -> P
     def record(samples: _Samples, segment: NDArray[np.intp]) -> None:
         order = np.argsort(-samples.surplus, kind="stable")
         smaller = order[samples.surplus[order] < surplus[segment[order]]]
-        # Of several samples of a segment the last assignment counts: that of the least clearance.
+        # Among several samples of a segment the last assignment counts: the minimum clearance.
         clearances[segment[smaller]] = samples.clearances[smaller]
         worst[segment[smaller]] = samples.q[smaller]
         free[segment[~(samples.surplus >= -ROUNDING)]] = False
@@ -168,9 +168,9 @@ def check_path(query: CollisionQuery, q: Array, find_minimum: bool = False) -> P
     record(end, segment)
     while len(segment):
         bound = sampler.approach_bound(start, end)
-        floor = max(float(surplus.min()) - RESOLUTION, 0.0) if find_minimum else 0.0
+        floor = max(float(surplus.min()) - PATH_RESOLUTION, 0.0) if find_minimum else 0.0
         is_uncertain = start.surplus + end.surplus < bound + 2 * floor
-        is_uncertain &= (bound > 2 * RESOLUTION) & free[segment]
+        is_uncertain &= (bound > 2 * PATH_RESOLUTION) & free[segment]
         rows = np.flatnonzero(is_uncertain)
         if not len(rows):
             break
@@ -182,16 +182,16 @@ def check_path(query: CollisionQuery, q: Array, find_minimum: bool = False) -> P
     return PathCheck(free, worst, surplus, clearances[:, 1], clearances[:, 2].astype(np.int64))
 
 
-def least_clearance(query: CollisionQuery, q: Array) -> tuple[float, str]:
-    """Return the least clearance on the straight segments between consecutive postures.
+def minimum_clearance(query: CollisionQuery, q: Array) -> tuple[float, str]:
+    """Return the minimum clearance on the straight segments between consecutive postures.
 
     Args:
         query: As in `check_path`.
         q: (k, n) postures.
 
     Returns:
-        Clearance [m], which is nowhere less by more than `RESOLUTION` on a free path; and which
-        pair touches, "" on a free path.
+        Minimum clearance [m], with an error of at most `PATH_RESOLUTION` on a free path; and the
+        colliding pair as text, "" on a free path.
     """
     if len(q) < 2:
         q = np.concatenate([q, q])
@@ -204,7 +204,7 @@ def least_clearance(query: CollisionQuery, q: Array) -> tuple[float, str]:
 
 
 def _middle_poses(start: Array, end: Array) -> Array:
-    """Return the poses (m, s, 12) in the middle: mean origins and mean rotations."""
+    """Return the poses (m, s, 12) with mean origins and mean rotations."""
     mean = (start + end) / 2
     rotates = (start[..., :9] != end[..., :9]).any(axis=(1, 2))
     rows = np.flatnonzero(rotates)
@@ -218,11 +218,11 @@ class PathChecker(Protocol):
     """Collision checks of a robot that carries an object."""
 
     def path_obstruction(self, q: Array) -> str:
-        """Return what obstructs the straight path through postures (k, n), "" if it is free."""
+        """Return the reason why the straight path through postures (k, n) is not free, or ""."""
         ...
 
     def contact_at(self, q: Array) -> str:
-        """Return what touches in one posture (1, n), "" if nothing does."""
+        """Return the colliding pair of a posture (1, n) as text, "" if it is free."""
         ...
 
 
@@ -234,7 +234,7 @@ def _is_obstructed(query: CollisionQuery | PathChecker, q: Array) -> bool:
 
 
 def _contact_at(query: CollisionQuery | PathChecker, q: Array) -> str:
-    """Return what touches in one posture (1, n), "" if nothing does."""
+    """Return the colliding pair of a posture (1, n) as text, "" if it is free."""
     if not isinstance(query, CollisionQuery):
         return query.contact_at(q)
     if query.free(q)[0]:
@@ -243,9 +243,9 @@ def _contact_at(query: CollisionQuery | PathChecker, q: Array) -> str:
 
 
 STRIDES = (0.02, 0.005, 0.002)
-"""Longest motor steps between the postures that the planner checks [rad, or part of the range].
+"""Maximum motor steps between the postures that the planner checks [rad, or fraction of the range].
 
-The finer ones are used if a path turns out not to be free between these postures.
+A finer step is used if a path is not free between these postures.
 """
 
 
@@ -263,7 +263,7 @@ def plan_path(
     seed: int,
     limit: float = 5.0,
 ) -> tuple[Array | None, str]:
-    """Plan a path that is free of collisions; it is straight if the straight line is free.
+    """Plan a collision-free path, which is straight if the straight line is free.
 
     Args:
         robot: Robot that moves.
@@ -274,8 +274,8 @@ def plan_path(
         limit: Time limit of the planner [s].
 
     Returns:
-        Corners (k, n) of the path, None if there is none; and how it was planned, or why it was
-        not.
+        Corners (k, n) of the path, None on failure; and how it was planned, or the reason of the
+        failure.
     """
     units, straight = motor_units(robot), np.stack([start, end])
     if query is None or not _is_obstructed(query, straight):
@@ -294,7 +294,7 @@ def plan_path(
     lower = np.where(endless, np.minimum(start, end) - np.pi, robot.lower)
     upper = np.where(endless, np.maximum(start, end) + np.pi, robot.upper)
     if not (query is None or isinstance(query, CollisionQuery)):
-        # The hand keeps its grasp: it does not move, except for rounding.
+        # The hand keeps its grasp; the interval allows for rounding.
         hand = np.isin(np.arange(n), robot.description.hand_actuators)
         lower = np.where(hand, np.minimum(start, end) - 1e-7, lower)
         upper = np.where(hand, np.maximum(start, end) + 1e-7, upper)

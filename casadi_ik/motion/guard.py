@@ -1,10 +1,11 @@
 """Collision avoidance of a follower, cycle by cycle.
 
-Two rules keep a follower free of collisions. The goal avoids obstacles softly, as far as contacts
-permit: small clearances are rows of its least squares. And a step is made only if the robot can
+Two rules keep a follower free of collisions. The goal avoids obstacles as far as the contacts
+permit: small clearances are rows of its least-squares problem. And a step is made only if the robot
+    can
 brake to rest afterwards without violating a margin in any cycle; otherwise motors brake. The step
 before was made under the same condition, so braking is safe: by induction the robot never violates
-the margin of what stands still.
+the margin of a static obstacle.
 
 Cycles between which a pair cannot come near are skipped, and so are pairs that were far apart when
 all pairs were last compared. Both bounds are steps of motors times levers
@@ -29,7 +30,7 @@ def stopping_distance(step: Array, change: Array) -> Array:
 
     Args:
         step: (n,) their last steps.
-        change: (n,) largest change of a step from cycle to cycle.
+        change: (n,) maximum change of a step from cycle to cycle.
     """
     cycles = np.floor(np.abs(step) / change)
     return np.sign(step) * (np.abs(step) * cycles - change * cycles * (cycles + 1) / 2)
@@ -41,7 +42,7 @@ def stopping_path(q: Array, step: Array, change: Array) -> Array:
     Args:
         q: (n,) positions before the step.
         step: (n,) step.
-        change: (n,) largest change of a step from cycle to cycle.
+        change: (n,) maximum change of a step from cycle to cycle.
 
     Returns:
         (k, n) positions at the end of each cycle; the first is after the step, the last at rest.
@@ -56,16 +57,16 @@ class Guard:
     """Collision checks of a follower in its scene.
 
     Attributes:
-        near: Clearance beyond the margin below which the goal avoids a pair [m].
+        avoidance_distance: Clearance beyond the margin below which the goal avoids a pair [m].
         nudge: Step of the finite differences of clearances [rad or m].
         exact: Accuracy of distances of solids, with a reserve [m].
-        shares: Parts of the wanted step that are tried in turn before a motor brakes.
+        fractions: Fractions of the requested step that are attempted before a motor brakes.
     """
 
-    near = 0.01
+    avoidance_distance = 0.01
     nudge = 1e-4
     exact = 1e-6
-    shares = (1.0,)
+    fractions = (1.0,)
 
     def __init__(self, plan: FollowPlan) -> None:
         """Prepare the scene for targets that all fingers touch."""
@@ -99,7 +100,7 @@ class Guard:
         """Allocate the memory of the compiled checks."""
         query = self._query
         self._required = query.margin + self.exact
-        self._avoided = query.margin + self.near
+        self._avoided = query.margin + self.avoidance_distance
         self._levers = levers(self._robot, query.table)
         self._compiled = None
         if query.kernel.entry is not None:
@@ -111,7 +112,7 @@ class Guard:
                 self._hand,
                 self._side,
                 self._change,
-                self.shares,
+                self.fractions,
                 required_distance=self._required,
                 avoided_distance=self._avoided,
                 nudge=self.nudge,
@@ -185,18 +186,18 @@ class Guard:
             guarding.stop_in_time()
             return guarding.share, guarding.step, guarding.q_rest
         braked = np.sign(last_step) * np.maximum(np.abs(last_step) - self._change, 0.0)
-        shares, attempts = np.array([*self.shares, 0.0]), np.zeros(self._n, dtype=int)
+        fractions, attempts = np.array([*self.fractions, 0.0]), np.zeros(self._n, dtype=int)
         while True:
-            step = braked + shares[attempts] * (wanted_step - braked)
+            step = braked + fractions[attempts] * (wanted_step - braked)
             path = stopping_path(q, step, self._change)
             initial, *distances = self._query.kernel.all_distances(
                 np.concatenate([q[None], path]), self._query.poses, self._query.table
             )
             is_touching = ~(distances >= np.minimum(initial, self._required)).all(axis=0)
             is_reduced = self._blocking_motors(self._levers[is_touching] > 0)
-            is_reduced &= attempts < len(self.shares)
+            is_reduced &= attempts < len(self.fractions)
             if not is_reduced.any():
-                return shares[attempts], step, path[-1]
+                return fractions[attempts], step, path[-1]
             attempts += is_reduced
 
     def _blocking_motors(self, moves_pair: Bools) -> Bools:

@@ -112,8 +112,8 @@ class FollowerInputs:
 
     def state_at(self, q: Array) -> Array:
         """Return the state of rest at a posture (n,)."""
-        rest = {item.name: np.zeros(item.shape) for item in self.cycle.state}
-        return self.cycle.state.pack(rest | {"q": q, "goal": q, "locked_on": 1.0})
+        zeros = {item.name: np.zeros(item.shape) for item in self.cycle.state}
+        return self.cycle.state.pack(zeros | {"q": q, "goal": q, "locked_on": 1.0})
 
     def _fill(self, **values: ArrayLike) -> None:
         for name, value in values.items():
@@ -134,7 +134,7 @@ class FollowerInputs:
         return rows
 
     def set_contacts(self, points: Array, normals: Array | None) -> None:
-        """Set contacts of all fingers; after the step `is_finite` tells whether they were valid.
+        """Set contacts of all fingers; `is_finite` is their validity after the step.
 
         Args:
             points: (f, 3) [m].
@@ -157,14 +157,14 @@ class FollowerInputs:
         return math.isfinite(self.run.record[-1])
 
     def set_partial_contacts(self, points: Array, normals: Array) -> str:
-        """Set contacts of which some may be free.
+        """Set contacts that may be partly free.
 
         Args:
             points: (f, 3) [m]; all NaN where a finger is free.
             normals: (f, 3) of any length; all NaN where free.
 
         Returns:
-            Reason why they are invalid, "" if they are valid. Invalid contacts are not set.
+            Reason why the contacts are invalid, "" if they are valid. Invalid contacts are not set.
         """
         reason = invalid_frame_reason(points, normals)
         if reason:
@@ -184,7 +184,7 @@ class FollowerInputs:
         self._fill(**tolerance_rows(problem.tolerances))
 
     def set_palms(self, poses: Mapping[str | None, Array], weight: tuple[float, float]) -> None:
-        """Set target poses (4, 4) of palms by side; they count as far as contacts permit."""
+        """Set target poses (4, 4) of palms by side, which have a lower priority than contacts."""
         for side, pose in poses.items():
             values = {"point": pose[:3, 3], "axes": pose[:3, :3], "weight": weight}
             self._fill(**{side_name(f"palm_{name}", side): value for name, value in values.items()})
@@ -195,7 +195,7 @@ class FollowerInputs:
             self._fill(**{side_name("palm_weight", side): 0.0})
 
     def exact_error_ratio(self, q: Array) -> float:
-        """Return the largest error of the present target over its tolerance at a posture (n,)."""
+        """Return the maximum error relative to the tolerance of the target at a posture (n,)."""
         errors = np.stack(self.errors(q))
         tolerances = np.stack([self.views["position_tolerance"], self.views["angle_tolerance"]])
         return float(np.nanmax(errors / np.maximum(tolerances, 1e-12)))
@@ -207,13 +207,15 @@ class FollowerInputs:
         def target(name: str, is_set: Bools) -> Array:
             return np.where(is_set[:, None], self.views[name], np.nan)[None]
 
-        more = {
+        extra_vectors = {
             f"{name}s": target(f"{name}s", np.any(self.views[f"{name}s"], axis=1))
             for name in self.cycle.contacts.data[2:]
         }
         points, normals = target("points", weights[:, 0] > 0), target("normals", weights[:, 1] > 0)
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-        problem = TargetBatch(points, normals, Tolerance(), enforce_limits=True, extra_vectors=more)
+        problem = TargetBatch(
+            points, normals, Tolerance(), enforce_limits=True, extra_vectors=extra_vectors
+        )
         position, angle, _ = deviations(self._robot, problem, q[None])
         return position[0], angle[0]
 

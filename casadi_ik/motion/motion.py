@@ -72,8 +72,8 @@ def rates_of(robot: ArmHand, velocity: Any, acceleration: Any) -> Rates:
     return Rates(limits, positive_per_motor(robot, "acceleration", acceleration))
 
 
-def shares(q: Array, period: float, rates: Rates) -> tuple[float, float]:
-    """Return the largest velocity and acceleration of samples relative to the limits.
+def limit_fraction(q: Array, period: float, rates: Rates) -> tuple[float, float]:
+    """Return the maximum velocity and acceleration of samples relative to the limits.
 
     The motors are at rest before the first sample and after the last one.
 
@@ -83,8 +83,8 @@ def shares(q: Array, period: float, rates: Rates) -> tuple[float, float]:
         rates: Limits of velocities and accelerations.
 
     Returns:
-        Shares of the velocity limits (first differences) and of the acceleration limits (second
-        differences).
+        Velocity (first differences) and acceleration (second differences) as fractions of the
+        limits.
     """
     velocity, acceleration = differences(q, period)
     return (
@@ -245,7 +245,7 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
         q = unit * trajectory(np.linspace(0.0, trajectory.duration, count + 1))
         q = np.clip(q, path.min(axis=0), path.max(axis=0))  # remove rounding errors
         q[0], q[-1] = path[0], path[-1]
-        velocity, acceleration = shares(q, period, rates)
+        velocity, acceleration = limit_fraction(q, period, rates)
         slowdown = max(velocity, math.sqrt(acceleration))
         if slowdown <= 1.0:
             return q

@@ -35,8 +35,8 @@ SETTLING = 0.1
 FOLLOWING_PULL = 0.1
 """Weight of the anchor of a follower.
 
-Source: of 16 random smooth paths of kuka_lwr_barrett at half the velocity limits, a follower with
-1e-3 misses a part of three, with 0.1 of one (3.6 % of the cycles).
+Source: 16 random smooth paths of kuka_lwr_barrett at half the velocity limits. With 1e-3 the
+follower misses cycles of three paths, with 0.1 of one (3.6 % of the cycles).
 """
 
 PATH_PULL = 1e-5
@@ -68,11 +68,11 @@ class MovingSolver:
         Args:
             q0: (n,) positions of the motors at rest [rad or m]; None: home.
             period: Time from cycle to cycle [s].
-            velocity: Velocity limits of the motors, (n,) or a number [rad/s or m/s]; None: those of
-                the description, or the range of a motor in one second if it has none.
-            acceleration: Acceleration limits, (n,) or a number [rad/s^2 or m/s^2]; None: those that
-                reach the velocity limit from rest in a quarter of a second.
-            posture: (n,) posture to which free motions lead; None: q0.
+            velocity: Velocity limits of the motors, (n,) or a number [rad/s or m/s]; None: the
+                limits of the description; for a motor without a limit, its range in one second.
+            acceleration: Acceleration limits, (n,) or a number [rad/s^2 or m/s^2]; None: the
+                velocity limit is reached from rest in a quarter of a second.
+            posture: (n,) posture to which unconstrained motors move; None: q0.
             settling: Time constant of free motions [s].
 
         Raises:
@@ -112,16 +112,16 @@ class MovingSolver:
     ) -> Track:
         """Track a known path of grasps: every solution continues the previous one.
 
-        The motion begins at the solution of the first grasp from which the others are reached
-        without a jump between branches; jumps that cannot be avoided are reported. With a scene the
-        motion stops before obstacles.
+        The motion begins at a solution of the first grasp from which the path continues without a
+        jump between branches. Unavoidable jumps are reported. With a scene the motion stops before
+        obstacles.
 
         Args:
             grasps: Grasps in order; the tolerances are those of the first.
-            q0: (n,) positions of the motors near which the motion begins [rad or m]; None: it
-                begins far from the limits.
+            q0: (n,) motor positions; the motion begins at the nearest solution [rad or m]. None: it
+                begins at the solution with the largest limit margin.
             period: Time from one grasp to the next [s]. With a period the velocity limits are kept,
-                and grasps that move too fast are tracked as well as the limits permit.
+                and grasps that move too fast are tracked with an error.
             velocity: Velocity limits in place of those of the description, (n,) or a number [rad/s
                 or m/s].
             seed: See `solve`.
@@ -175,12 +175,12 @@ class MovingSolver:
         """Plan a timed motion from a configuration to a grasp.
 
         The robot moves to a pre-grasp with an open hand, approaches straight, and closes the hand.
-        Solutions of a grasp are tried, nearest first, until one can be reached; for a result of
-        `choose` (``ranked[0]``) only its own configuration is tried. With a scene the motion is
-        checked, also between its samples: the path to the pre-grasp is straight if that is free,
-        otherwise OMPL plans it; fingers touch the object only while they close. With `lift` or
-        `retreat` the motion continues: the object moves with the palm, and points of its surface
-        are checked against the scene.
+        The solutions of a grasp are attempted in the order of distance from q0; for a result of
+        `choose` (``ranked[0]``) only the configuration of the result is attempted. With a scene the
+        motion is checked, also between its samples: the path to the pre-grasp is straight if that
+        is free, otherwise OMPL plans it; fingers touch the object only while they close. With
+        `lift` or `retreat` the motion continues: the object moves with the palm, and points of its
+        surface are checked against the scene.
 
         Args:
             grasp: Grasp with a contact per finger, or a result of `choose`.
@@ -191,10 +191,11 @@ class MovingSolver:
             acceleration: See `follow`.
             period: Time between two samples of the motion [s].
             seed: Seed of the solver and of the path planner.
-            limit: Maximum number of solutions that are tried.
+            limit: Maximum number of attempted solutions.
             direction: (3,) direction of the approach, base frame: ``[0, 0, -1]`` is from above.
                 None: from the pre-grasp of the grasp (`Grasp.pregrasp`), or else from the palm to
-                the contacts; if that is blocked, from above, between both, or tilted to a side.
+                the contacts; if this direction is blocked, from above, between both, or tilted to a
+                side.
             lift: Height by which the hand is lifted along z of the base after closing [m].
             retreat: Length of the retreat along the reverse approach after that [m].
 
@@ -257,7 +258,7 @@ class MovingSolver:
             acceleration: See `follow`.
             period: Time between two samples of the motion [s].
             seed: Seed of the solver and of the path planner.
-            limit: Maximum number of solutions that are tried.
+            limit: Maximum number of attempted solutions.
             direction: (3,) reverse direction of the retreat, see `reach`.
 
         Returns:
@@ -279,33 +280,34 @@ class MovingSolver:
             >>> down.status.name, down.motion.notes["part"][-1].item()
             ('REACHED', 'leaving')
         """
-        chosen = getattr(held, "grasp", None)
-        if not isinstance(chosen, Grasp) or not hasattr(held, "q"):
+        grasp = getattr(held, "grasp", None)
+        if not isinstance(grasp, Grasp) or not hasattr(held, "q"):
             raise InputError(
                 f"held: found {type(held).__name__}, expected a result of choose or grasps_of with"
                 " grasp and q"
             )
         start, target = self._request.start(q0), single_pose(pose)
-        if chosen.known_pose is None:
+        if grasp.known_pose is None:
             raise InputError("held: object_pose of the grasp is missing, expected a pose")
         self.robot.description.require_single_hand("place")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
-        motion = target @ inverse(chosen.known_pose)
+        motion = target @ inverse(grasp.known_pose)
         q = self._request.start(held.q, "q")
         motors = self.robot.description.finger_motors
         hand = {name: float(q[self.robot.actuators.index(name)]) for name in motors}
-        palm = Grasp(robot=chosen.robot, palm=motion @ self.robot.palm(q), posture=hand)
-        placed = replace(chosen.at(motion), pregrasp=None)
-        approach_plan = self._approach_plan(placed, start, opening, distance, direction)
-        carried = None
+        palm = Grasp(robot=grasp.robot, palm=motion @ self.robot.palm(q), posture=hand)
+        target_grasp = replace(grasp.at(motion), pregrasp=None)
+        approach_plan = self._approach_plan(target_grasp, start, opening, distance, direction)
+        carried_object = None
         if self._engine.check is not None:
-            carried = CarriedObject(self._engine.check, self._request.of_grasps([chosen], None), q)
+            held_target = self._request.of_grasps([grasp], None)
+            carried_object = CarriedObject(self._engine.check, held_target, q)
         pace, height = self._pace(velocity, acceleration, period), length("lower", lower)
         plan = ReachPlan(approach_plan, pace, seed, np.clip(start, *approach_plan.plan.bounds))
         problem = self._request.of_grasps([palm], None)
         solutions = self._solutions(palm, problem, start, seed, limit)
-        return place(plan, *solutions, carried, height)
+        return place(plan, *solutions, carried_object, height)
 
     def move(
         self,
@@ -319,8 +321,8 @@ class MovingSolver:
         """Plan a timed motion from rest to rest between two configurations.
 
         With a scene the motion is free of collisions, also between its samples; no finger may touch
-        the grasped object of the scene. Where the straight line of the motors is not free, OMPL
-        plans another path.
+        the grasped object of the scene. If the straight line in configuration space is not free,
+        OMPL plans another path.
 
         Args:
             q0: (n,) first configuration [rad or m].
@@ -342,9 +344,9 @@ class MovingSolver:
             >>> found.success, bool((found.motion.q[-1] == solution.q).all())
             (True, True)
         """
-        ends = self._request.start(q0), self._request.start(q1, "q1")
+        endpoints = self._request.start(q0), self._request.start(q1, "q1")
         lower, upper = self._bounds(None)
-        for name, q in zip(("q0", "q1"), ends, strict=True):
+        for name, q in zip(("q0", "q1"), endpoints, strict=True):
             excess = np.maximum(lower - q, q - upper)
             i = int(excess.argmax())
             if not excess[i] <= LIMIT_SLACK:
@@ -358,7 +360,7 @@ class MovingSolver:
             query = check.collision_query(self._placeholder_target(np.nan)).rows(
                 np.zeros(1, dtype=np.intp)
             )
-        return move(self.robot, ends, query, pace, seed)
+        return move(self.robot, endpoints, query, pace, seed)
 
     def approach(
         self,
@@ -372,10 +374,10 @@ class MovingSolver:
     ) -> Approach:
         """Plan the straight approach to a grasp, from a pre-grasp to the closed hand.
 
-        The hand is open at the pre-grasp and moves straight. Solutions of the grasp are tried,
-        nearest to q0 first; for a result of `choose` only its own configuration is tried. With a
-        scene the approach is checked, also between its postures; fingers touch the object only
-        while they close.
+        The hand is open at the pre-grasp and moves straight. The solutions of the grasp are
+        attempted in the order of distance from q0; for a result of `choose` only the configuration
+        of the result is attempted. With a scene the approach is checked, also between its postures;
+        fingers touch the object only while they close.
 
         Args:
             grasp: See `reach`.
@@ -383,7 +385,7 @@ class MovingSolver:
             opening: Distance of the fingertips from their contacts before they close [m].
             q0: (n,) positions of the motors [rad or m]; None: home.
             seed: Seed of the solver.
-            limit: Maximum number of solutions that are tried.
+            limit: Maximum number of attempted solutions.
             direction: See `reach`.
 
         Raises:
@@ -430,7 +432,7 @@ class MovingSolver:
     ) -> tuple[list[Array], str]:
         """Return the solutions (n,) of a grasp, nearest first, and the reason if there are none.
 
-        A result of `choose` has only its own configuration.
+        A result of `choose` has a single configuration.
         """
         if not isinstance(grasp, Grasp):
             q = self._request.start(grasp.q, "q")

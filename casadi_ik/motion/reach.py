@@ -26,8 +26,8 @@ from casadi_ik.motion.approach import (
     approaches,
     hands_used,
 )
-from casadi_ik.motion.free_path import least_clearance, plan_path
-from casadi_ik.motion.motion import Motion, Rates, shares, timed
+from casadi_ik.motion.free_path import minimum_clearance, plan_path
+from casadi_ik.motion.motion import Motion, Rates, limit_fraction, timed
 
 
 class CarriedObject:
@@ -35,9 +35,9 @@ class CarriedObject:
 
     Attributes:
         step: Motion of the palm between two checks of the object [m].
-        motor_step: Motion of all motors together between two checks of the robot [rad].
-        slack: Decrease of the object's distance from its support that is permitted while the hand
-            takes it away [m].
+        motor_step: Norm of the motor motion between two checks of the robot [rad].
+        slack: Permitted decrease of the object's distance from its support while the hand lifts
+            it [m].
     """
 
     step = 1e-3
@@ -57,7 +57,7 @@ class CarriedObject:
         pose = None if problem.object_pose is None else problem.object_pose[0]
         if pose is None and self._name in check.scene.items:
             pose = check.scene.items[self._name].pose
-        # An object in the hands of several sides moves with the first of them.
+        # An object in the hands of several sides moves with the first of these sides.
         is_used = hands_used(check.robot, problem)[:, 0] > 0
         hands = check.robot.hands
         holding_sides = [side for side, hand in hands.items() if is_used[list(hand)].any()]
@@ -70,13 +70,13 @@ class CarriedObject:
         return self._robot.palm(q, self._side)
 
     def path_obstruction(self, q: Array) -> str:
-        """Return what obstructs the straight path through postures (k, n), "" if it is free."""
+        """Return the reason why the straight path through postures (k, n) is not free, or ""."""
         # Between postures the object moves straight and the palm on an arc, so steps are small.
         fine = _resampled(q, q, self.motor_step)
-        return least_clearance(self._query_at(fine), fine)[1] or self._object_contact(q)
+        return minimum_clearance(self._query_at(fine), fine)[1] or self._object_contact(q)
 
     def contact_at(self, q: Array) -> str:
-        """Return what touches in one posture (1, n), "" if nothing does."""
+        """Return the colliding pair of a posture (1, n) as text, "" if it is free."""
         clearances = self._query_at(q).check(q)
         if not clearances.free[0]:
             return f"{' and '.join(clearances.pair(0) or ())} touch"
@@ -91,7 +91,9 @@ class CarriedObject:
         return self._check.collision_query(carrying, carried=True)
 
     def _object_contact(self, q: Array, initial: float | None = None) -> str:
-        """Return which obstacle the object touches, unless it was as near initially.
+        """Return the contact of the object with an obstacle as text, "" if there is none.
+
+        Contacts that existed initially do not count.
 
         Args:
             q: (k, n) postures.
@@ -120,19 +122,19 @@ def _resampled(q: Array, positions: Array, step: float) -> Array:
     Args:
         q: (k, n) postures.
         positions: (k, d) positions of a point in these postures.
-        step: Largest distance of two consecutive positions.
+        step: Maximum distance between two consecutive positions.
     """
     lengths = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     counts = np.maximum(np.ceil(lengths / step), 1).astype(int)
-    shares = [i + np.arange(count) / count for i, count in enumerate(counts)]
-    parameters = np.append(np.concatenate([np.zeros(0), *shares]), len(q) - 1)
+    fractions = [i + np.arange(count) / count for i, count in enumerate(counts)]
+    parameters = np.append(np.concatenate([np.zeros(0), *fractions]), len(q) - 1)
     return np.array([np.interp(parameters, np.arange(len(q)), column) for column in q.T]).T
 
 
 PARTS = ("going", "coming", "closing", "lifting", "retreating")
 """Parts of a motion: to the pre-grasp, approach, closing, lifting and retreat with the object."""
 
-GOING, COMING, CLOSING, LIFTING, RETREATING = PARTS
+TRANSFER, APPROACH, CLOSING, LIFTING, RETREATING = PARTS
 
 CARRYING, LOWERING, OPENING, LEAVING = "carrying", "lowering", "opening", "leaving"
 """Parts of a motion that places: carrying, lowering, opening of the hand, straight retreat."""
@@ -152,12 +154,12 @@ class Reach(RecordReprMixin):
             "part" names the part (of `PARTS`) of each sample. None on failure.
         q: (n,) solution of the grasp at which the hand closes, or the requested posture; None on
             failure.
-        clearance: Smallest distance before the hand closes [m], see `Clearances`; between samples
-            it is less by at most 0.1 mm. None without a scene.
-        tried: Number of solutions of the grasp that were tried.
-        velocity_share: Largest velocity of the samples (first differences) relative to the limits;
+        clearance: Minimum clearance at the samples before the hand closes [m], see `Clearances`;
+            between samples it is lower by at most 0.1 mm. None without a scene.
+        tried: Number of attempted solutions of the grasp.
+        velocity_share: Maximum velocity of the samples (first differences) relative to the limits;
             0 without a motion.
-        acceleration_share: Largest acceleration of the samples (second differences) relative to the
+        acceleration_share: Maximum acceleration of the samples (second differences) relative to the
             limits; 0 without a motion.
 
     Example:
@@ -227,7 +229,7 @@ class _Stage:
     Attributes:
         segments: Segments in their order.
         query: Collision checks; None checks nothing.
-        counts: True if their clearance counts as that of the motion.
+        counts: True if the clearance of the segments is part of `Reach.clearance`.
     """
 
     segments: Sequence[Segment]
@@ -238,7 +240,7 @@ class _Stage:
 def reach(
     plan: ReachPlan, solutions: Sequence[Array], reason: str, lift: float, retreat: float
 ) -> Reach:
-    """Plan a motion to the first solution of a grasp that can be reached.
+    """Plan a motion to the first reachable solution of a grasp.
 
     Args:
         plan: Requirements.
@@ -253,9 +255,9 @@ def reach(
         path = attempt.path
         if path is None:
             return failed(ReachStatus.NO_APPROACH, attempt.reason)
-        carried = None if check is None else CarriedObject(check, problem, attempt.q)
-        ends, _ = robot.contacts(path.coming[[0, -1]])
-        back = ends[0] - ends[1]
+        carried_object = None if check is None else CarriedObject(check, problem, attempt.q)
+        (first_tips, last_tips), _ = robot.contacts(path.coming[[0, -1]])
+        back = first_tips - last_tips
         back /= np.maximum(np.linalg.norm(back, axis=1, keepdims=True), 1e-9)
         q, is_used, segments = attempt.q, hands_used(robot, problem), list[Segment]()
         for name, shift in ((LIFTING, lift * UP), (RETREATING, retreat * back)):
@@ -265,16 +267,16 @@ def reach(
             if postures is None:
                 reason = f"the arm cannot follow the straight line of {name}"
                 return failed(ReachStatus.NO_RETREAT, reason)
-            if carried is not None and (reason := carried.path_obstruction(postures)):
+            if carried_object is not None and (reason := carried_object.path_obstruction(postures)):
                 return failed(ReachStatus.NO_RETREAT, f"{name} is not free: {reason}")
             segments.append((name, postures))
             q = postures[-1]
-        going, note = _plan_segments(plan, GOING, path.coming[0], attempt.open_query)
+        transfer, note = _plan_segments(plan, TRANSFER, path.coming[0], attempt.open_query)
         stages = (
-            _Stage(going, attempt.open_query),
-            _Stage([(COMING, path.coming)], attempt.coming_query),
+            _Stage(transfer, attempt.open_query),
+            _Stage([(APPROACH, path.coming)], attempt.coming_query),
             _Stage([(CLOSING, path.closing)], attempt.closing_query, counts=False),
-            _Stage(segments, carried, counts=False),
+            _Stage(segments, carried_object, counts=False),
         )
         return _timed_motion(robot, stages, plan.pace, note, attempt.q, attempt.number)
 
@@ -285,17 +287,17 @@ def place(
     plan: ReachPlan,
     solutions: Sequence[Array],
     reason: str,
-    carried: CarriedObject | None,
+    carried_object: CarriedObject | None,
     lower: float,
 ) -> Reach:
-    """Plan a motion that places the object in the hand, to the first solution that permits it.
+    """Plan a motion that places the object in the hand, for the first solution that permits it.
 
     Args:
         plan: Requirements; the hand leaves the object along the reverse approach.
         solutions: (n,) postures in which the object has its target pose, best first.
         reason: Reason why there are no solutions.
-        carried: Collision checks of robot and object; None checks nothing.
-        lower: Height from which the object is lowered straight [m].
+        carried_object: Collision checks of robot and object; None checks nothing.
+        lower: Height above the target pose from which the object is lowered straight [m].
     """
 
     def plan_motion(attempt: ApproachAttempt) -> Reach:
@@ -307,11 +309,11 @@ def place(
         if up is None:
             return failed(ReachStatus.NO_APPROACH, "the arm cannot follow the straight line down")
         down = up[::-1]
-        if carried is not None and (obstruction := carried.path_obstruction(down)):
+        if carried_object is not None and (obstruction := carried_object.path_obstruction(down)):
             return failed(ReachStatus.NO_APPROACH, f"the path down is not free: {obstruction}")
-        carrying, note = _plan_segments(plan, CARRYING, down[0], carried)
+        carrying, note = _plan_segments(plan, CARRYING, down[0], carried_object)
         stages = (
-            _Stage([*carrying, (LOWERING, down)] if carrying else [], carried, counts=False),
+            _Stage([*carrying, (LOWERING, down)] if carrying else [], carried_object, counts=False),
             _Stage([(OPENING, path.closing[::-1])], attempt.closing_query, counts=False),
             _Stage([(LEAVING, path.coming[::-1])], attempt.coming_query),
         )
@@ -321,20 +323,24 @@ def place(
 
 
 def move(
-    robot: ArmHand, ends: tuple[Array, Array], query: CollisionQuery | None, pace: Pace, seed: int
+    robot: ArmHand,
+    endpoints: tuple[Array, Array],
+    query: CollisionQuery | None,
+    pace: Pace,
+    seed: int,
 ) -> Reach:
     """Plan a motion from one posture (n,) to another.
 
     Args:
         robot: Robot that moves.
-        ends: First and last posture.
+        endpoints: First and last posture.
         query: Collision checks; None checks nothing.
         pace: Timing.
         seed: Seed of the path planner.
     """
-    corners, note = plan_path(robot, *ends, query, seed)
-    stages = [_Stage(_segments(GOING, corners), query)]
-    return _timed_motion(robot, stages, pace, note, ends[1], 1)
+    corners, note = plan_path(robot, *endpoints, query, seed)
+    stages = [_Stage(_segments(TRANSFER, corners), query)]
+    return _timed_motion(robot, stages, pace, note, endpoints[1], 1)
 
 
 def _first_motion(
@@ -343,7 +349,7 @@ def _first_motion(
     reason: str,
     plan_motion: Callable[[ApproachAttempt], Reach],
 ) -> Reach:
-    """Return the first motion that succeeds, or the failure that got farthest."""
+    """Return the first successful motion, or the failure of the latest planning stage."""
     if not solutions:
         return failed(ReachStatus.NOT_SOLVED, reason)
     failures: list[Reach] = []
@@ -353,14 +359,14 @@ def _first_motion(
             return result
         failures.append(result)
     order = list(ReachStatus)
-    farthest = max(failures, key=lambda result: order.index(result.status))
-    return failed(farthest.status, farthest.reason, len(solutions))
+    latest = max(failures, key=lambda result: order.index(result.status))
+    return failed(latest.status, latest.reason, len(solutions))
 
 
 def _plan_segments(
     plan: ReachPlan, name: str, end: Array, query: CollisionQuery | CarriedObject | None
 ) -> tuple[list[Segment], str]:
-    """Plan the free path from q0; return its segments, and how it was planned or why it was not."""
+    """Return the segments of a free path from q0, and how it was planned or the failure."""
     corners, note = plan_path(plan.robot, plan.q0, end, query, plan.seed)
     return _segments(name, corners), note if corners is None else f"path: {note}"
 
@@ -369,13 +375,13 @@ def _segments(name: str, corners: Array | None) -> list[Segment]:
     return [] if corners is None else [(name, np.stack(pair)) for pair in pairwise(corners)]
 
 
-def failed(status: ReachStatus, reason: str, tried: int = 0) -> Reach:
+def failed(status: ReachStatus, reason: str, attempts: int = 0) -> Reach:
     """Return the result of a failure."""
-    return Reach(status, reason, None, None, None, tried)
+    return Reach(status, reason, None, None, None, attempts)
 
 
 def _timed_motion(
-    robot: ArmHand, stages: Sequence[_Stage], pace: Pace, note: str, q: Array, tried: int
+    robot: ArmHand, stages: Sequence[_Stage], pace: Pace, note: str, q: Array, attempts: int
 ) -> Reach:
     """Return the timed motion of consecutive stages, at rest between segments, and check it.
 
@@ -383,9 +389,9 @@ def _timed_motion(
         robot: Robot that moves.
         stages: Stages; the planning has failed if the first has no segments.
         pace: Timing.
-        note: How the path was planned, or why it was not.
+        note: How the path was planned, or the reason of the failure.
         q: (n,) posture at the grasp, or at the end.
-        tried: Number of solutions that were tried.
+        attempts: Number of attempted solutions.
     """
     if not stages[0].segments:
         return failed(ReachStatus.NO_WAY, note)
@@ -404,11 +410,12 @@ def _timed_motion(
         if isinstance(stage.query, CarriedObject):
             reason = stage.query.path_obstruction(postures)
         elif stage.query is not None:
-            stage_clearance, reason = least_clearance(stage.query, postures)
+            stage_clearance, reason = minimum_clearance(stage.query, postures)
             if stage.counts:
-                known = () if clearance is None else (clearance,)
-                clearance = min((stage_clearance, *known))
+                clearance = (
+                    stage_clearance if clearance is None else min(clearance, stage_clearance)
+                )
         if reason:
             return failed(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
-    limit_shares = shares(motion.q, pace.period, pace.rates)
-    return Reach(ReachStatus.REACHED, note, motion, q, clearance, tried, *limit_shares)
+    limit_fractions = limit_fraction(motion.q, pace.period, pace.rates)
+    return Reach(ReachStatus.REACHED, note, motion, q, clearance, attempts, *limit_fractions)

@@ -1,15 +1,14 @@
 """Recovery of a follower that is stuck.
 
-A follower descends to a local minimum: after contacts that were out of reach, or at an obstacle, it
-may be stuck although it followed the same contacts before. `Recovery` therefore stores a *trail*:
-the postures that the motors have passed, at distances of `SPACING`. If the contacts were met before
-and their error has not decreased for `PATIENCE`, it computes the error at the postures of the
-trail, a few of them in a cycle. If the least error is less than `GAIN` times the present one, the
-motors stop and return to that posture. They move on straight lines, each from rest to rest: to the
-first posture of the trail, counted from the destination, to which the line is free, so they take
-short cuts. Where no line is free, as in contact with an obstacle, the motors first increase the
-clearances. The lines are checked at a few postures in a cycle, and the guard checks every step in
-addition.
+A follower descends to a local minimum: after contacts out of reach, or at an obstacle, it may be
+stuck although it followed the same contacts before. `Recovery` therefore stores a *trail*: previous
+postures of the motors, at distances of `SPACING`. If the contacts were met before and their error
+has not decreased for `PATIENCE`, it computes the error at the postures of the trail, a few of them
+per cycle. If the minimum error is less than `GAIN` times the present one, the motors stop and
+return to that posture. They move on straight lines, each from rest to rest: to the first posture of
+the trail, counted from the destination, to which the line is free, so they take short cuts. If no
+line is free, as in contact with an obstacle, the motors first increase the clearances. The lines
+are checked at a few postures per cycle, and the guard also checks every step.
 """
 
 from __future__ import annotations
@@ -24,41 +23,43 @@ from casadi_ik.motion.inputs import FollowerInputs
 from casadi_ik.solve.verdict import TOLERANCE_SLACK
 
 SPACING = 0.1
-"""Distance of the postures of a trail [rad, or part of a slider's range], in the largest motor."""
+"""Maximum motor distance between postures of a trail [rad, or fraction of a slider's range]."""
 
 CAPACITY = 128
-"""Maximum number of postures of a trail; beyond it every second one is dropped, not the first."""
+"""Maximum number of postures of a trail; a full trail is thinned to every second posture."""
 
 CHECK_PERIOD = 0.01
 """Minimum time between two checks whether a posture is added to the trail [s]."""
 
 PATIENCE = 0.2
-"""Time without progress after which a follower is stuck [s]."""
+"""Time without progress after which a follower counts as stuck [s]."""
 
 SEARCH_TIME = 0.5
 """Time in which all postures of a full trail are compared with the target [s]."""
 
 GAIN = 0.5
-"""Error at the destination of a return, relative to the present error, at most."""
+"""Maximum error at the destination of a return, relative to the present error."""
 
 PROGRESS = 0.99
-"""Factor below which an error counts as decreased, relative to the least one before."""
+"""Maximum ratio of an error to the previous minimum that counts as a decrease."""
 
-RESOLUTION = 0.02
-"""Distance of the postures at which a line is checked, in units as `SPACING`."""
+LINE_RESOLUTION = 0.02
+"""Distance between the checked postures of a line, in the units of `SPACING`."""
 
 CHECKS = 8
-"""Number of postures of a line that are checked in a cycle."""
+"""Number of postures of a line that are checked per cycle."""
 
-MAX_LINES = 40
+MAX_RETURN_LINES = 40
 """Maximum number of lines of one return."""
 
 MAX_STOPS = 6
-"""Maximum number of stops in one return, by the guard or because no line is free; after another one
-the follower compares postures again, because the target may have moved."""
+"""Maximum number of stops in one return, by the guard or because no line is free.
+
+After another stop the follower compares postures again, because the target may have moved.
+"""
 
 MET = 1 + TOLERANCE_SLACK
-"""Largest error ratio at which the contacts are met."""
+"""Maximum error ratio at which the contacts are met."""
 
 
 def brake(distance: float, change: float) -> float:
@@ -117,8 +118,8 @@ class Recovery:
         remaining = max(1.0 - self._done, 0.0)
         limit = min(self._line_fastest, self._line_step + self._line_change)
         self._next_step = min(limit, brake(remaining, self._line_change))
-        share = self._done + self._next_step
-        return self._start + share * self._line - state[: len(self._units)]
+        progress = self._done + self._next_step
+        return self._start + progress * self._line - state[: len(self._units)]
 
     def update(self, inputs: FollowerInputs, q: Array, last_step: Array, is_stopped: bool) -> None:
         """Evaluate the result of a cycle.
@@ -210,7 +211,7 @@ class Recovery:
             self._target = -1
 
     def _continue_return(self, q: Array, last_step: Array, is_stopped: bool) -> None:
-        """Record a step of the return, and choose the next line where one ends."""
+        """Record a step of the return, and choose the next line at the end of a line."""
         if not self._has_line:
             if not last_step.any():
                 self._choose_line(q)
@@ -237,21 +238,21 @@ class Recovery:
         self._checked = 0
 
     def _choose_line(self, q: Array) -> None:
-        """Check a part of a line, and start the motion along it once all of it is free."""
+        """Check a part of a line, and start the motion along it after all parts were free."""
         if self._target < 0:
             self._target, self._checked = self._destination, 0
             self._lines += 1
-            if self._lines > MAX_LINES:
+            if self._lines > MAX_RETURN_LINES:
                 self.follow()
                 return
         line = self._trail[self._target] - q
-        count = math.ceil(float((np.abs(line) / self._units).max()) / RESOLUTION)
+        count = math.ceil(float((np.abs(line) / self._units).max()) / LINE_RESOLUTION)
         last = min(self._checked + CHECKS, count)
         if self._guard is None or self._target == self._count - 1:
             self._checked = count
         elif last > self._checked:
-            shares = np.arange(self._checked + 1, last + 1)[:, None] / count
-            if not self._guard.are_free(q + shares * line):
+            fractions = np.arange(self._checked + 1, last + 1)[:, None] / count
+            if not self._guard.are_free(q + fractions * line):
                 self._try_shorter_line()
                 return
             self._checked = last
@@ -265,7 +266,7 @@ class Recovery:
                 self._move_away(q)
 
     def _move_away(self, q: Array) -> None:
-        """Increase the clearances of a posture from which no line is free, as one in contact."""
+        """Increase the clearances of a posture from which no line is free."""
         if self._guard is None or self._stops > MAX_STOPS:
             self.follow()
             return

@@ -304,7 +304,7 @@ class Retargeter:
                 raise InputError(f"keypoints: found shape {frame.shape}, expected one frame")
             if np.shape(joints)[0] == KEYPOINTS:
                 was_decided = hand.order.is_decided
-                frame = hand.in_usual_order(frame)
+                frame = hand.in_standard_order(frame)
                 if hand.order.is_decided and not was_decided and not hand.has_begun:
                     self._R_base_keypoints = None
             if hand.accepts(frame, elapsed):
@@ -330,7 +330,7 @@ class Retargeter:
     def screened(
         self, recorded: Mapping[str | None, Array], times: Array
     ) -> tuple[dict[str | None, Array], list[str]]:
-        """Return recorded frames with NaN in those of a lost hand, and the reasons.
+        """Return recorded frames with NaN where the tracker has lost the hand, and the reasons.
 
         Args:
             recorded: (k, 21, 3) keypoints by side [m].
@@ -343,8 +343,8 @@ class Retargeter:
             hand.order.assume_standard()
             frame_reasons = hand.filter.rejection_reasons(frames, times)
             screened[side] = frames.copy()
-            lost = [i for i, reason in enumerate(frame_reasons) if reason]
-            screened[side][lost] = np.nan
+            rejected = [i for i, reason in enumerate(frame_reasons) if reason]
+            screened[side][rejected] = np.nan
             reasons += [reason for reason in frame_reasons if reason]
         return screened, reasons
 
@@ -368,12 +368,14 @@ class Retargeter:
         if self.config.rpy is not None:
             return _rotation(self.config.rpy)
         hands = [self._hands[side] for side in frames]
-        spread = [hand.spread(frame) for hand, frame in zip(hands, frames.values(), strict=True)]
+        pairs = [
+            hand.tip_offsets(frame) for hand, frame in zip(hands, frames.values(), strict=True)
+        ]
         wrists = np.array([frame[self.config.wrist] for frame in frames.values()])
         palms = np.array([hand.palm[:3, 3] for hand in hands])
         # The positions of the hands relative to each other; zero for a single hand.
-        spread.append((wrists - wrists.mean(axis=0), palms - palms.mean(axis=0)))
-        return _aligned(*(np.concatenate(vectors) for vectors in zip(*spread, strict=True)))
+        pairs.append((wrists - wrists.mean(axis=0), palms - palms.mean(axis=0)))
+        return _aligned(*(np.concatenate(vectors) for vectors in zip(*pairs, strict=True)))
 
 
 class _Hand:
@@ -383,7 +385,7 @@ class _Hand:
         rows: Indices of its retargeted fingers among those of the robot.
         palm: (4, 4) initial pose of its palm.
         in_hand: True if the origin of the keypoints is in the hand.
-        filter: Filter of frames of a tracker that has lost the hand.
+        filter: Filter that rejects frames in which the tracker has lost the hand.
         order: Converter of frames to the common order.
     """
 
@@ -427,7 +429,7 @@ class _Hand:
         """True after the first accepted frame."""
         return self._first is not None
 
-    def in_usual_order(self, frame: Array) -> Array:
+    def in_standard_order(self, frame: Array) -> Array:
         """Return a frame (21, 3) in the common order.
 
         The hand starts again when another order is recognised.
@@ -440,7 +442,7 @@ class _Hand:
         return frame
 
     def accepts(self, frame: Array, elapsed: float) -> bool:
-        """Return True if keypoints (21, 3) are those of a hand; the first must be in metres."""
+        """Return True if keypoints (21, 3) form a hand; the first frame must be in metres."""
         if not self.filter.accepts(frame, elapsed):
             return False
         if not self._is_recognised:
@@ -452,13 +454,13 @@ class _Hand:
         """Return the newest frame (21, 3), mirrored and smoothed as configured."""
         if self._side_config.mirror:
             frame = _mirrored(frame, self._config.wrist)
-        share = 1 - (1 - self._config.low_pass) ** (RATE * elapsed)
+        gain = 1 - (1 - self._config.low_pass) ** (RATE * elapsed)
         previous = frame if self._smooth is None else self._smooth
-        self._smooth = smooth = previous + share * (frame - previous)
+        self._smooth = smooth = previous + gain * (frame - previous)
         return smooth
 
-    def spread(self, frame: Array) -> tuple[Array, Array]:
-        """Return the fingertips (k, 3) relative to the wrist: the person's, the robot's at q0."""
+    def tip_offsets(self, frame: Array) -> tuple[Array, Array]:
+        """Return the fingertips (k, 3) of the person and of the robot at q0, from the wrist."""
         tips = frame[self._keys] - frame[self._config.wrist]
         return tips, self._tips[self.rows] - self.palm[:3, 3]
 
@@ -516,7 +518,7 @@ class _Hand:
 
 
 def _reaches(robot: ArmHand, side: str | None) -> Array:
-    """Return the largest distances (f,) of a robot's fingertips from its palm [m]."""
+    """Return the maximum distances (f,) of a robot's fingertips from its palm [m]."""
     q = robot.random(np.random.default_rng(0), HAND_SIZE_TUNING.postures)
     vectors = robot.contacts(q)[0] - robot.palm(q, side)[:, None, :3, 3]
     return np.linalg.norm(vectors, axis=2).max(axis=0)
@@ -531,8 +533,8 @@ def _reach(frame: Array, wrist: int, key: int) -> float:
 
 def _mirrored(frame: Array, wrist: int) -> Array:
     """Return the frame of the other hand with the same wrist and the same orientation."""
-    across = _hand_axes(frame, wrist)[:, 1]
-    return frame - 2 * np.outer((frame - frame[wrist]) @ across, across)
+    lateral = _hand_axes(frame, wrist)[:, 1]
+    return frame - 2 * np.outer((frame - frame[wrist]) @ lateral, lateral)
 
 
 def _rotation(rpy: tuple[float, float, float]) -> Array:
@@ -546,11 +548,11 @@ def _aligned(tips: Array, robot_tips: Array) -> Array:
 
 
 def _hand_axes(frame: Array, wrist: int) -> Array:
-    """Return the axes (3, 3) of a hand as columns: along it, across it, out of its back."""
+    """Return the axes (3, 3) of a hand as columns: longitudinal, lateral, dorsal."""
     index, little = (frame[number] - frame[wrist] for number in KNUCKLES)
-    along = _unit(index + little)
-    out = _unit(np.cross(index, little))
-    return np.stack([along, np.cross(out, along), out], axis=1)
+    longitudinal = _unit(index + little)
+    dorsal = _unit(np.cross(index, little))
+    return np.stack([longitudinal, np.cross(dorsal, longitudinal), dorsal], axis=1)
 
 
 def _unit(vector: Array) -> Array:

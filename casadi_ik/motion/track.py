@@ -34,15 +34,16 @@ def contacts_between(targets: TargetBatch, i: int, count: int) -> TargetBatch:
         vectors = interpolate(values)
         return vectors / np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), 1e-12)
 
-    normals, more = interpolate_directions(targets.normals), {}
+    normals, extra_vectors = interpolate_directions(targets.normals), {}
     for name, values in targets.extra_vectors.items():
         vectors = interpolate_directions(values)
         if name == "tangents":
             vectors -= normals * np.sum(normals * vectors, axis=2, keepdims=True)
             vectors /= np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), 1e-12)
-        more[name] = vectors
+        extra_vectors[name] = vectors
     points = interpolate(targets.points)
-    return replace(targets, points=points, normals=normals, extra_vectors=more, object_pose=None)
+    vectors = {"points": points, "normals": normals, "extra_vectors": extra_vectors}
+    return replace(targets, **vectors, object_pose=None)
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,15 @@ class TrackTuning:
     """Parameters of tracking a known path. Source: ``studies/moving.py``.
 
     Attributes:
-        cycles: Cycles per grasp: grasps of a path may be farther apart than targets of a stream.
+        cycles: Number of cycles per grasp. Source: grasps of a path may be farther apart than
+            targets of a stream.
         leap: Motion of a motor from one grasp to the next, relative to its range, above which the
-            contacts are moved in small steps.
-        substeps: Number of these steps.
-        settling: Cycles per grasp before it counts as missed.
-        block: Number of grasps that are tracked at once; those after a missed one are discarded.
-        starts: Maximum number of solutions of the first grasp that are tried.
+            contacts are interpolated.
+        substeps: Number of interpolation steps.
+        settling: Maximum number of cycles before a grasp counts as missed.
+        block: Number of grasps that are tracked at once; results after a missed grasp are
+            discarded.
+        starts: Maximum number of attempted solutions of the first grasp.
     """
 
     cycles: int = 2
@@ -394,13 +397,13 @@ def track(
 
 
 def _free_between(query: CollisionQuery, q: Array, jumps: Sequence[Jump]) -> Bools:
-    """Return which segments (k - 1,) between postures (k, n) are free; jumps are not."""
+    """Return (k - 1,) True for free segments between postures (k, n), False for jumps."""
     jump_rows = np.array([jump.index for jump in jumps], dtype=np.intp)
     free = np.ones(max(len(q) - 1, 0), dtype=bool)
     free[jump_rows - 1] = False
-    ends = np.flatnonzero(np.append(~free, True)) + 1
+    run_ends = np.flatnonzero(np.append(~free, True)) + 1
     first = 0
-    for end in ends.tolist():
+    for end in run_ends.tolist():
         rows = np.arange(first, end)
         free[first : end - 1] = check_path(query.rows(rows), q[rows]).free
         first = end
@@ -408,7 +411,7 @@ def _free_between(query: CollisionQuery, q: Array, jumps: Sequence[Jump]) -> Boo
 
 
 def _limit_travel(path: Array, travel: Array) -> Array:
-    """Return motions (k, n) straight towards a path (k, n) with limited steps."""
+    """Return a motion (k, n) that follows a path (k, n) with limited steps."""
     q = path.copy()
     for i in range(1, len(q)):
         step = path[i] - q[i - 1]

@@ -41,7 +41,7 @@ from casadi_ik.solve.status import Status
 from casadi_ik.solve.turns import in_nearest_turns, nearest_turns, search_start
 
 RankingPreference: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
-"""One of `PREFERENCES`, or a function from a robot and configurations (m, n) to scores (m,)."""
+"""Name in `PREFERENCES`, or function of a robot and configurations (m, n) to scores (m,)."""
 
 
 @dataclass(frozen=True)
@@ -50,10 +50,10 @@ class ChooseParameters:
 
     Attributes:
         chunk_size: Number of candidates that are searched together.
-        max_restarts: Maximum number of restarts per candidate. A single grasp of a hand with many
-            motors gets many more, but most of many candidates are out of reach.
-        refined_factor: Number of arms that are refined, as a multiple of the number of solutions
-            to return.
+        max_restarts: Maximum number of restarts per candidate. A solve of a single grasp permits
+            more, but among many candidates most are out of reach.
+        refined_factor: Number of arm configurations that are refined, as a multiple of the number
+            of solutions to return.
     """
 
     chunk_size: int = 1024
@@ -94,7 +94,8 @@ class CandidateSolutions:
         """Concatenate the solutions of parts of the candidates.
 
         Args:
-            parts: Indices of candidates, and their solutions. The last reason of a candidate holds.
+            parts: Indices of candidates, and their solutions. The last reason of a candidate is
+                kept.
             count: Number of all candidates.
         """
         reasons = np.full(count, "", dtype=object)
@@ -123,9 +124,9 @@ def choose(
 ) -> Ranking:
     """Rank candidate grasps and return the best feasible solutions.
 
-    For every candidate all hands that meet its contacts are searched, with every branch of the arm
-    over its whole redundancy, free of collision if the solver has a scene. Whether a candidate has
-    a solution depends neither on `q0` nor on `prefer`, which only rank.
+    The search covers all hand postures that meet the contacts of a candidate, every branch of the
+    arm and its whole redundancy. With a scene, solutions are collision-free. `q0` and `prefer`
+    affect only the ranking, not whether a candidate has a solution.
 
     Args:
         solver: A `Solver`.
@@ -136,21 +137,21 @@ def choose(
         limit: Maximum number of solutions.
         prefer: Ranking: "q0", "limits", "manipulability", "clearance" as for `solve`, or a
             function from the robot and configurations (m, n) to scores (m,), where higher is
-            better and -inf excludes. None: "q0" if q0 is given, else "limits". Fixed motors and
-            given hand postures do not count for "limits".
+            better and -inf excludes. None: "q0" if q0 is set, else "limits". "limits" ignores
+            fixed motors and prescribed hand postures.
         seed: As for `solve`.
         fixed: As for `solve`.
-        apart: Minimum difference of solutions: in any two at least one actuator differs by this
-            fraction of its range, 0 to 1. 0: all that are not equal.
-        per_candidate: Maximum number of solutions per candidate. None: unlimited, and the search
-            ends when there are `limit` solutions.
+        apart: Minimum difference of two solutions: at least one actuator differs by this fraction
+            of its range, 0 to 1. 0: solutions must not be equal.
+        per_candidate: Maximum number of solutions per candidate. None: unlimited; the search ends
+            after `limit` solutions.
 
     Returns:
-        The solutions, best first, and the reasons why candidates have none.
+        The solutions, best first, and the number of unsolved candidates by reason.
 
     Raises:
-        InputError: There are no candidates, object_pose is not rigid, q0, limit, preference or
-            difference is invalid, or the robot has no fingers for a grasp.
+        InputError: There are no candidates, `object_pose` is not rigid, another argument is
+            invalid, or a grasp has fingers that the robot does not have.
         UnsupportedError: The method is not hand-first.
 
     Example:
@@ -175,7 +176,7 @@ def choose(
     parts = list(search.solve(np.ones(len(grasps), dtype=bool), thorough=False))
     solutions = CandidateSolutions.concatenate(parts, len(grasps))
     best = search.best(solutions, apart, max_per_candidate)
-    # Without a limit per candidate, `limit` solutions of the candidates so far are enough.
+    # Without a limit per candidate, the search ends after `limit` solutions.
     is_complete = per_candidate is None and len(best) >= limit
     solved_count = limit if is_complete else solutions.is_solved.sum()
     if solved_count < min(limit, len(grasps)):
@@ -205,7 +206,7 @@ def _candidates(grasps: Iterable[Grasp]) -> Sequence[Grasp]:
     """Return the candidates as a sequence.
 
     Raises:
-        InputError: They are not a sequence of grasps.
+        InputError: `grasps` is not a sequence of grasps.
     """
     if isinstance(grasps, (Grasp, str, Mapping)) or not isinstance(grasps, Iterable):
         raise InputError(f"grasps: found {type(grasps).__name__}, expected a sequence of grasps")
@@ -216,7 +217,7 @@ def _positive_count(value: int, name: str) -> int:
     """Return a count as an integer.
 
     Raises:
-        InputError: It is not an integer >= 1.
+        InputError: The value is not an integer >= 1.
     """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"{name}: found {value!r}, expected an integer >= 1")
@@ -231,7 +232,7 @@ def _checked_scores(
     def score(q: Array) -> Array:
         try:
             scores = np.asarray(prefer(robot, q.copy()), dtype=float)
-        except Exception as error:  # the caller's function may raise anything
+        except Exception as error:  # a user-defined function may raise any exception
             problem = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             raise InputError(
                 f"prefer: the function raised {problem}; expected scores ({len(q)},)"
@@ -257,10 +258,10 @@ def _target_groups(
         Indices of candidates, and their targets in the base frame.
 
     Raises:
-        InputError: There are no candidates, or one is not a `Grasp`.
+        InputError: There are no candidates, or a candidate is not a `Grasp`.
     """
     if not len(grasps):
-        raise InputError("grasps: found none, expected at least one")
+        raise InputError("grasps: the sequence is empty; expected at least one grasp")
     groups: dict[object, list[int]] = {}
     for number, grasp in enumerate(grasps):
         if not isinstance(grasp, Grasp):
@@ -285,7 +286,7 @@ def _with_object_pose(
     known_poses = [grasp.known_pose for grasp in grasps if grasp.known_pose is not None]
     vectors = {"points": targets.points, "normals": targets.normals, **targets.extra_vectors}
     for name, array in vectors.items() if known_poses else ():
-        # Into the object frame first.
+        # Transform base-frame vectors into the object frame.
         stack = np.stack(known_poses)
         shift = stack[:, None, :3, 3] if name == "points" else 0.0
         vectors[name] = (array - shift) @ stack[:, :3, :3]
@@ -315,7 +316,7 @@ class _Search:
     Attributes:
         engine: The engine.
         groups: Indices and targets of candidates with equal fingers and contact kinds.
-        start: (n,) initial configuration, which `prefer` may refer to.
+        start: (n,) initial configuration, the reference of the preference "q0".
         prefer: The preference.
         limit: Number of solutions to return.
         seed: Seed of random arms.
@@ -333,12 +334,12 @@ class _Search:
     ) -> Iterator[tuple[NDArray[np.intp], CandidateSolutions]]:
         """Yield the solutions of selected candidates in chunks, with their indices.
 
-        Neither the preference nor the start decides whether a candidate has a solution.
+        Whether a candidate has a solution does not depend on the preference or the start.
 
         Args:
             is_selected: (k,) True for the candidates to solve.
-            thorough: Try all hands that a single grasp would get, with up to
-                `ChooseParameters.max_restarts` restarts, instead of the hands of one restart.
+            thorough: True for up to `ChooseParameters.max_restarts` restarts, False for a single
+                restart.
         """
         for indices, targets in self.groups:
             selected = indices[is_selected[indices]]
@@ -355,13 +356,13 @@ class _Search:
                 yield selected[rows], chunk.solve(thorough)
 
     def best(
-        self, solutions: CandidateSolutions, apart: float, max_per_candidate: int
+        self, solutions: CandidateSolutions, min_difference: float, max_per_candidate: int
     ) -> list[tuple[int, Solution]]:
-        """Return the best solutions that differ from each other, and their rows.
+        """Return the best distinct solutions and their rows.
 
         Args:
             solutions: The solutions.
-            apart: Minimum difference, see `choose`.
+            min_difference: Minimum difference of two solutions, see `apart` of `choose`.
             max_per_candidate: Maximum number of solutions per candidate.
         """
         robot, limit = self.engine.robot, self.limit
@@ -370,24 +371,24 @@ class _Search:
         fractions = solutions.q / (robot.upper - robot.lower)
         verified: dict[int, Solution] = {}
         while True:
-            chosen, remaining = list[int](), order
+            best_rows, remaining = list[int](), order
             quota = np.full(len(solutions.reasons), max_per_candidate)
-            while len(remaining) and len(chosen) < limit:
+            while len(remaining) and len(best_rows) < limit:
                 row = int(remaining[0])
-                chosen.append(row)
+                best_rows.append(row)
                 quota[solutions.candidate[row]] -= 1
                 difference = np.abs(fractions[remaining] - fractions[row]).max(axis=1)
-                is_distinct = (difference >= apart) & (difference > 0)
+                is_distinct = (difference >= min_difference) & (difference > 0)
                 remaining = remaining[is_distinct & (quota[solutions.candidate[remaining]] > 0)]
-            new_rows = np.setdiff1d(chosen, [*verified]).astype(np.intp)
+            new_rows = np.setdiff1d(best_rows, [*verified]).astype(np.intp)
             verified |= self._verify(solutions, new_rows)
-            failed = [row for row in chosen if not verified[row].success]
+            failed = [row for row in best_rows if not verified[row].success]
             if not failed:
-                return [(row, verified[row]) for row in chosen]
+                return [(row, verified[row]) for row in best_rows]
             order = order[~np.isin(order, failed)]
 
     def _verify(self, solutions: CandidateSolutions, rows: NDArray[np.intp]) -> dict[int, Solution]:
-        """Return the verdicts on solutions by their row."""
+        """Return the checked solutions by row."""
         verified: dict[int, Solution] = {}
         for indices, targets in self.groups:
             group_rows = rows[np.isin(solutions.candidate[rows], indices)]
@@ -423,7 +424,7 @@ class _Chunk:
         self.home, self.starts = (np.tile(q, (len(targets), 1)) for q in starts)
         self.limits = self.subproblems.limits(targets)
         fixed = np.full(len(search.start), np.nan) if targets.fixed is None else targets.fixed
-        # Motors that are fixed in all targets do not rank solutions.
+        # Motors that are fixed in all targets are excluded from the limit margin.
         self.columns = np.flatnonzero(np.isnan(np.atleast_2d(fixed)).any(axis=0)).tolist()
 
     def solve(self, thorough: bool) -> CandidateSolutions:
@@ -457,10 +458,11 @@ class _Chunk:
     def _resolve_collisions(
         self, q: Array, rows: NDArray[np.intp], query: CollisionQuery
     ) -> tuple[Array, NDArray[np.intp], dict[int, tuple[str, str]]]:
-        """Search collision-free solutions as for a single grasp.
+        """Search for collision-free solutions as for a single grasp.
 
         Returns:
-            Collision-free solutions, their candidates, and the colliding pairs of the others.
+            Collision-free solutions, their candidates, and the colliding pair of each candidate
+            without one.
         """
         result = find_collision_free(
             self.finder,
@@ -476,7 +478,7 @@ class _Chunk:
         return result.q[result.free], rows[result.free], pairs
 
     def _hands(self, q: Array, rows: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
-        """Return different hands that meet the contacts, with an arm for each.
+        """Return distinct hand postures that meet the contacts, each with an arm configuration.
 
         Args:
             q: (m, n) first solutions.
@@ -490,21 +492,23 @@ class _Chunk:
         postures = self.subproblems.method.postures(self.targets.rows(rows), 0)
         starts = self.limits.clip(self.home)
         candidate, *initial = self.subproblems.hand_rows(self.targets, rows, starts, postures)
-        ends, targets = self.subproblems.run(*initial), self.targets.rows(candidate)
-        ends[~self.subproblems.solved(targets, ends, targets.enforce_limits)] = np.nan
-        solutions = np.concatenate([q[:, None], ends.reshape(len(rows), -1, q.shape[1])], axis=1)
+        refined_q, targets = self.subproblems.run(*initial), self.targets.rows(candidate)
+        refined_q[~self.subproblems.solved(targets, refined_q, targets.enforce_limits)] = np.nan
+        solutions = np.concatenate(
+            [q[:, None], refined_q.reshape(len(rows), -1, q.shape[1])], axis=1
+        )
         is_solved: Bools = np.all(np.isfinite(solutions), axis=2)
         row, posture = np.nonzero(is_solved)
         hands, candidate = solutions[row, posture], rows[row]
         coordinates = self.finder.hand_coordinates(hands)
-        known = Deduplicator(len(rows), coordinates.shape[1], ALTERNATIVES.min_difference)
-        is_new = known.add(coordinates, row)
+        distinct = Deduplicator(len(rows), coordinates.shape[1], ALTERNATIVES.min_difference)
+        is_new = distinct.add(coordinates, row)
         return hands[is_new], candidate[is_new]
 
     def _solutions(
         self, q: Array, candidate: NDArray[np.intp]
     ) -> tuple[Array, NDArray[np.intp], dict[int, tuple[str, str]]]:
-        """Return the preferred collision-free arm of every branch of hands.
+        """Return the preferred collision-free arm configuration of every branch, by hand posture.
 
         Returns:
             Configurations, their candidates, and the colliding pairs of candidates without one.

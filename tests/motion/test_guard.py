@@ -10,7 +10,7 @@ from samplers import smooth_path
 from toy_robots import grasp_of, grasps_of
 
 import casadi_ik as ik
-from casadi_ik.motion.free_path import RESOLUTION, check_path, motor_units
+from casadi_ik.motion.free_path import PATH_RESOLUTION, check_path, motor_units
 
 PERIOD = 0.004
 
@@ -173,7 +173,7 @@ def test_a_path_keeps_clear(robot, solver):
     # Between the postures, too, as far as that is looked into.
     assert track.free_between is not None
     assert track.free_between.all()
-    assert clearances(solver, dense(track.q, motor_units(robot))).surplus.min() >= -RESOLUTION
+    assert clearances(solver, dense(track.q, motor_units(robot))).surplus.min() >= -PATH_RESOLUTION
 
 
 def test_obstacle_between_free_postures_is_detected(robot):

@@ -13,7 +13,7 @@ from dense_ways import dense
 
 import casadi_ik as ik
 from casadi_ik.motion.free_path import motor_units, plan_path
-from casadi_ik.motion.motion import rates_of, shares, timed
+from casadi_ik.motion.motion import limit_fraction, rates_of, timed
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_short_and_kinked_paths_are_timed(robot):
             path = robot.home + np.cumsum(np.concatenate([np.zeros((1, 14)), steps]), axis=0)
             q = timed(path, rates, 0.01)
             np.testing.assert_array_equal(q[[0, -1]], path[[0, -1]])
-            assert max(shares(q, 0.01, rates)) <= 1
+            assert max(limit_fraction(q, 0.01, rates)) <= 1
             assert ((q >= path.min(axis=0)) & (q <= path.max(axis=0))).all()
 
 

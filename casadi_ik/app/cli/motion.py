@@ -146,11 +146,11 @@ def _start(solver: Solver, frames: Frames) -> Array:
 
 def _lost_frames_text(frames: Frames) -> str:
     """Return the number of rejected frames and the most frequent reasons; "" if there are none."""
-    if not frames.lost:
+    if not frames.rejection_reasons:
         return ""
-    counts = Counter(frames.lost).most_common(2)
+    counts = Counter(frames.rejection_reasons).most_common(2)
     texts = ", ".join(f"{reason} ({count})" for reason, count in counts)
-    return f"{len(frames.lost)} of {len(frames.times)}: {texts}"
+    return f"{len(frames.rejection_reasons)} of {len(frames.times)}: {texts}"
 
 
 def _collision_text(solver: Solver) -> str:
