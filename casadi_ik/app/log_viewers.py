@@ -43,8 +43,8 @@ with optional_import("viewer files"):
     from foxglove import messages as fox
     from scipy.spatial.transform import Rotation
 
-ITERATION_PERIOD = 10_000_000
-"""Time between two iterations [ns]."""
+PLAYBACK_PERIOD = 10_000_000
+"""Time between two iterations during playback [ns]."""
 
 FREE_COLOR = "#999999"
 """Colour of the contact of a free finger."""
@@ -83,7 +83,7 @@ class _View:
         self.robot = robot
         self.root = robot.description.root
         self.q = solve.rows["q"].astype(float)
-        self.times = solve.started + ITERATION_PERIOD * np.arange(len(solve.rows))
+        self.times = solve.started + PLAYBACK_PERIOD * np.arange(len(solve.rows))
 
     def write(self) -> None:
         """Write all topics one after another; readers sort messages by time."""

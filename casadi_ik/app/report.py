@@ -202,7 +202,7 @@ def report_of(result: object, robot: ArmHand | None = None) -> Group:
             return solution_report(result, robot)
         case BatchSolution():
             scene = None if result.clearance is None else "given"
-            return Totals.of(result).report(result.method, result.robot, scene)
+            return Totals.of_batch(result).report(result.method, result.robot, scene)
         case Choice():
             score = f"candidate {result.candidate}, score {result.score:.4g}"
             return solution_report(result.solution, robot, score)
@@ -398,7 +398,7 @@ class Totals:
         self._times.append(arrays["time"].astype(np.float32))
 
     @classmethod
-    def of(cls, batch: BatchSolution) -> Totals:
+    def of_batch(cls, batch: BatchSolution) -> Totals:
         """Return the totals of a complete batch."""
         reasons = [diagnosis.reason.name if diagnosis else "" for diagnosis in batch.diagnoses]
         totals = cls()

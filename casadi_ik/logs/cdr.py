@@ -19,6 +19,11 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.chunks import CDR_HEADER, MESSAGE
 from casadi_ik.logs.container import open_log_file, read_chunk, read_contents
 
+
+class NoMotionError(LogError):
+    """Error of an intact log without a motion, such as a log of solves."""
+
+
 Stamp = tuple[int, int]
 """Seconds and nanoseconds of a time or duration."""
 
@@ -172,7 +177,8 @@ def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
     """Read a motion from an MCAP file; `ArmHand.contacts` computes its contacts.
 
     Raises:
-        LogError: The file is missing, damaged, not an MCAP file, or holds no motion.
+        LogError: The file is missing, damaged, or not an MCAP file.
+        NoMotionError: The log holds no motion.
 
     Example:
         >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
@@ -192,7 +198,7 @@ def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
                     start = run.start + MESSAGE.itemsize
                     messages[topics[run.channel]] = chunk.data[start : run.start + run.size]
         if len(messages) < len(required):
-            raise LogError(
+            raise NoMotionError(
                 f"motion: found topics {', '.join(topics.values()) or 'none'}; expected"
                 f" {', '.join(required)}"
             )

@@ -341,7 +341,8 @@ class Log:
                 if "solve_id" in part.names:
                     rows["solve_id"] += np.uint32(offset)
                 part = replace(part, rows=rows, solve_id=part.solve_id + offset)
-            part = replace(part, shard=sources.of(i, method, part.solve_id), shards=sources.names)
+            shard_indices = sources.original_shards(i, method, part.solve_id)
+            part = replace(part, shard=shard_indices, shards=sources.names)
             row_format = part.rows.dtype.descr, sorted(part.labels.items())
             groups.setdefault(repr(row_format), []).append(part)
         parts = [self._sort(_concatenate(group), kind) for group in groups.values()]

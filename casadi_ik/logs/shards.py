@@ -362,7 +362,7 @@ class ShardOrigins:
                 differences[key] = tuple(values)
         return differences
 
-    def of(self, file: int, method: str, numbers: Counts) -> Counts:
+    def original_shards(self, file: int, method: str, numbers: Counts) -> Counts:
         """Return the index of the original shard of each solve.
 
         Args:

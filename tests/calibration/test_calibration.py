@@ -117,7 +117,7 @@ def test_outliers_are_found_and_cost_little(index):
     for row in spoilt:
         shift = dq.from_translation(ca.DM([0.02, -0.03, 0.01]))
         poses[row] = np.array(dq.multiply(shift, ca.DM(poses[row]))).ravel()
-    bad = Measurements(data.fingers, data.q, poses, data.turned)
+    bad = Measurements(data.fingers, data.q, poses, data.has_orientation)
     robust, squares = calibrate(index, bad), calibrate(index, bad, loss="squares")
     assert robust.outliers.tolist() == spoilt
     fresh = simulate(index, truth, "index", 60, rng, noise=EXACT)
@@ -225,7 +225,7 @@ def test_a_file_of_measurements_round_trip(index, ar10, tmp_path, rng):
     write_measurements(measurements, ar10.description, tmp_path / "poses.csv")
     read = read_measurements(tmp_path / "poses.csv", ar10.description)
     assert read.fingers == measurements.fingers
-    np.testing.assert_array_equal(read.turned, measurements.turned)
+    np.testing.assert_array_equal(read.has_orientation, measurements.has_orientation)
     np.testing.assert_allclose(point(read.poses), point(measurements.poses), atol=1e-15)
     np.testing.assert_allclose(read.poses[0], measurements.poses[0], atol=1e-14)
     # Actuators that do not move the finger are at home, whatever the file says.

@@ -110,6 +110,15 @@ def test_logs_play_concurrently(view, robot: ik.ArmHand, tmp_path: Path) -> None
     assert page.time_shown in {verdict for track in page.playbacks for verdict in track.event_times}
 
 
+def test_a_single_log_of_solves_opens(view, robot: ik.ArmHand, tmp_path: Path) -> None:
+    path = tmp_path / "cup.mcap"
+    ik.Solver(robot).solve(ik.load_grasp("cup"), log=path)
+    with pytest.raises(ik.logs.NoMotionError):
+        ik.logs.read_motion(path)
+    (playback,) = view(str(path)).page.playbacks
+    assert playback.unit == "iteration"
+
+
 def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     times = np.linspace(0.0, 2.0, 41)
     q = robot.home + 0.1 * np.sin(times)[:, None] * (np.arange(len(robot.home)) == 2)

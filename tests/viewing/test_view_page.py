@@ -58,7 +58,7 @@ def test_links_match_the_kinematics(cup: viewing.Viewer, rng: np.random.Generato
     page, robot = cup.page, cup.page.robot
     page.drag_motors(robot.random(rng, 1)[0])
     assert page.work.settle(300)
-    frames = {frame.name: frame for frame in page._drawn._frames}
+    frames = {frame.name: frame for frame in page._robot_view._frames}
     poses: dict[str, np.ndarray] = {"/robot": np.eye(4)}
     for name, mesh in frames.items():
         on = poses[name.rpartition("/")[0]]

@@ -13,10 +13,11 @@ import casadi_ik as ik
 from casadi_ik.app.drawing.drawables import item_drawables, visual_bodies
 from casadi_ik.app.drawing.surfaces import arrow, split_sharp_edges
 from casadi_ik.app.viewer import request_of
+from casadi_ik.app.viewer.camera import cameras
 from casadi_ik.app.viewer.pad_page import LinkPad, save_pads, with_corrected_pad
 from casadi_ik.app.viewer.page import IDLE_DELAY, LatestOnly
 from casadi_ik.app.viewer.panel import grasp_text
-from casadi_ik.app.viewer.viser_scene import cameras, pose_of, quaternions
+from casadi_ik.app.viewer.viser_scene import pose_of, quaternions
 from casadi_ik.compile.cancellation import stop_if_cancelled
 from casadi_ik.files.reading import Frame, frame_matrix
 

@@ -55,7 +55,7 @@ DEFAULT_PART_SIZE = 20_000
 """Default number of targets per part: a fraction of a second to a few seconds of one core."""
 
 
-def _out(word: str) -> Path:
+def _output_path(word: str) -> Path:
     """Parse the output: an npz or Parquet file, an existing folder, or a name without suffix."""
     path = opt.file_name()(word)
     if path.suffix.lower() not in ("", ".npz", ".parquet") and not path.is_dir():
@@ -73,7 +73,7 @@ def _out(word: str) -> Path:
     opt.REQUIRED_ROBOT,
     *opt.SOLVER,
     Option("--jobs N", "number of threads, or of processes for parts", 1),
-    opt.out("OUT", "OUT.npz, OUT.parquet, or a folder for parts (no suffix)", _out),
+    opt.out_option("OUT", "OUT.npz, OUT.parquet, or a folder for parts (no suffix)", _output_path),
     Option(
         "--dask ADDRESS",
         "Dask scheduler, tcp://HOST:8786 (needs dask[distributed])",

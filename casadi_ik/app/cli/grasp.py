@@ -47,7 +47,7 @@ from casadi_ik.solve.solution_files import RANKED_MEMBER, ranking_data
         "required payload [kg] and squeeze force [N]",
         parse=lambda words: opt.numbers(words, 2, "kg N"),
     ),
-    opt.SCENE,
+    opt.SCENE_FILE,
     Option(
         "--prefer load|clearance|limits|q0",
         "ranking criterion, see below",
@@ -55,9 +55,9 @@ from casadi_ik.solve.solution_files import RANKED_MEMBER, ranking_data
     ),
     Option("--limit N", "maximum number of grasps", 200, opt.integer(1)),
     opt.Q0,
-    opt.SEED,
+    opt.RANDOM_SEED,
     Option("--jobs N", "threads", 1, opt.integer(1)),
-    opt.out("FOUND.npz", "output file of the grasps"),
+    opt.out_option("FOUND.npz", "output file of the grasps"),
     opt.picture("--picture", "picture of the best nine grasps"),
     Option("--view", "show the grasps in the browser (needs 'casadi-ik[view]')"),
 )
@@ -121,7 +121,7 @@ def grasp(args: Arguments) -> CommandResult:
         best.add_row(str(rank), f"{entry.load:.3f}", clearance, " ".join(entry.grasp.contacts))
     title = headline(True, f"{len(grasps)} FOUND", subject)
     report = CommandResult.of_parts(True, title, counts, best, *files(outputs))
-    return replace(report, after=partial(_view, robot, grasps, scene)) if args.view else report
+    return replace(report, epilogue=partial(_view, robot, grasps, scene)) if args.view else report
 
 
 def _view(robot: ArmHand, grasps: FoundGrasps, scene: Scene | None) -> None:

@@ -31,18 +31,18 @@ from casadi_ik.model.targets import fixed_array
 
 @contextlib.contextmanager
 def located(
-    where: str, kinds: tuple[type[CasadiIKError], ...] = (InputError, UnknownNameError)
+    location: str, kinds: tuple[type[CasadiIKError], ...] = (InputError, UnknownNameError)
 ) -> Iterator[None]:
     """Prefix the message of errors with the file or option that they concern.
 
     Args:
-        where: File or option.
+        location: File or option.
         kinds: Types of the errors.
     """
     try:
         yield
     except kinds as error:
-        error.args = (f"{where}: {error}",)
+        error.args = (f"{location}: {error}",)
         raise
 
 

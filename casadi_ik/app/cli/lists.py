@@ -174,7 +174,7 @@ def _description_table(kind: str, head: str, schema: type[ObjectFile | SceneFile
     return rows
 
 
-@command(opt.out("DIR", "output folder"))
+@command(opt.out_option("DIR", "output folder"))
 def schemas(args: Arguments) -> CommandResult:
     """Write JSON Schemas of input files, for completion and checks in editors.
 

@@ -36,13 +36,13 @@ MAX_ITEMS = 12
 """Maximum number of names or numbers that a list shows."""
 
 ROUTINE_EVENTS = ("PHASE_CHANGE", "LIMIT_LEFT", "RELEASED")
-"""Kinds of events that occur in every solve; the list of solves leaves them out."""
+"""Kinds of events that occur in every solve, which the list of solves omits."""
 
 INCOMPLETE = "writer was killed or is still running (casadi-ik log finish)"
 """Explanation of files without a summary."""
 
 EMPTY = "no complete chunk"
-"""Reason for files of a study that are left out."""
+"""Reason for omitted files of a study."""
 
 LOGS = Option("FILE...", "logs, or folders of logs", key="files")
 LOG = Option("FILE", "log, or folder of shards")
@@ -115,7 +115,7 @@ def events(args: Arguments) -> CommandResult:
 
 
 @command(LOG, *SINGLE_SOLVE)
-def why(args: Arguments) -> CommandResult:
+def explain_solve(args: Arguments) -> CommandResult:
     """Explain one solve in words."""
     solve = _load_solve(args, logs.open(args.file))
     explanation = explain(solve)
@@ -196,7 +196,7 @@ def compare(args: Arguments) -> CommandResult:
 
 @command(
     LOGS,
-    opt.out("REPORT.html", "output file"),
+    opt.out_option("REPORT.html", "output file"),
     Option("--title TEXT", "title of the page (default: name of the log)"),
     Option("--most N", "maximum number of solves listed with details", 200),
 )
@@ -230,7 +230,7 @@ def report(args: Arguments) -> CommandResult:
         f"format (default: by suffix of --out: {', '.join(FORMAT_OF_SUFFIX)})",
     ),
     Option("--robot R", "robot of the viewer file (default: the log's)"),
-    opt.out("FILE", "output file", opt.file_name()),
+    opt.out_option("FILE", "output file", opt.file_name()),
 )
 def export(args: Arguments) -> CommandResult:
     """Write tables, or a file for a viewer.
@@ -293,7 +293,7 @@ def finish(args: Arguments) -> CommandResult:
     return CommandResult(Group(*parts))
 
 
-@command(LOGS, opt.out("FILE.mcap", "output file"))
+@command(LOGS, opt.out_option("FILE.mcap", "output file"))
 def merge(args: Arguments) -> CommandResult:
     """Merge the shards of a study without recompression."""
     check_outputs({"--out": args.out}, inputs=[path for path, _ in log_files(args.files)])

@@ -41,8 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
-    # Imported after the signal handlers are installed, so that Ctrl-C during the import ends in one
-    # line as well.
+    # Imported after the signal handlers are installed, so that Ctrl-C during the import also ends
+    # in one line.
     from casadi_ik.app.cli.outputs import print_message
     from casadi_ik.app.cli.table import Exit, parse
 
@@ -57,8 +57,8 @@ def _run(words: Sequence[str]) -> int:
             with _size_limits(getattr(args, "size_limits", None)):
                 result = run(args)
             _show(result.report)
-            if result.after is not None:
-                result.after()
+            if result.epilogue is not None:
+                result.epilogue()
             return result.exit
         except CasadiIKError as error:
             print_message("error", str(error))
@@ -182,7 +182,7 @@ def _abandon_stdout() -> None:
 
 @contextmanager
 def _size_limits(factor: float | None) -> Iterator[None]:
-    """Multiply the size limits of input files by a factor, in child processes as well."""
+    """Multiply the size limits of input files by a factor, also in child processes."""
     from casadi_ik.files.limits import LIMITS_VARIABLE
 
     previous = os.environ.get(LIMITS_VARIABLE)

@@ -35,7 +35,7 @@ from casadi_ik.motion.reach import PARTS, Reach
 from casadi_ik.motion.retarget import Retargeter, load_retarget, usual_retarget
 from casadi_ik.solve.solution_files import ChosenPosture, chosen_posture
 
-MOTION = opt.out(
+MOTION = opt.out_option(
     "MOTION.mcap", "output file (.mcap, .npz or .csv)", opt.file_name(".mcap", ".npz", ".csv")
 )
 
@@ -46,7 +46,7 @@ MOTION = opt.out(
     MOTION,
     Option("--retarget FILE.yaml", "retargeting settings (default: general-purpose)"),
     Option("--period SECONDS", "duration of a cycle", 0.005),
-    opt.SCENE,
+    opt.SCENE_FILE,
     *opt.TOLERANCES,
     opt.Q0,
     opt.SIZE_LIMITS,
@@ -68,7 +68,7 @@ def follow(args: Arguments) -> CommandResult:
     and optionally
       times     (k,) times of the frames [s] (default: 30 frames per second)
     Frames in which the tracker has lost the hand (NaN, zeros, -1, a jump) are
-    skipped: the motors come to rest and continue with the next valid frame.
+    skipped: the motors stop and continue with the next valid frame.
 
     --retarget FILE.yaml maps the human hand to the robot (docs/teleoperation.md):
       fingers: {thumb: 4, index: 8, middle: 12, ring: 16}
@@ -164,7 +164,7 @@ def _collision_text(solver: Solver) -> str:
     MOTION,
     opt.picture("--animation", "animation in real time"),
     opt.OBJECT_POSE,
-    opt.SCENE,
+    opt.SCENE_FILE,
     Option("--opening METRES", "gap between open fingertips and contacts [m]", 0.02),
     Option("--distance METRES", "length of the straight approach [m]", 0.08),
     Option(
@@ -175,7 +175,7 @@ def _collision_text(solver: Solver) -> str:
     Option("--lift METRES", "height of the lift with the object [m]", 0.0),
     Option("--retreat METRES", "retreat along the reverse approach [m]", 0.0),
     Option("--period SECONDS", "time between two samples", 0.01),
-    opt.SEED,
+    opt.RANDOM_SEED,
     *opt.TOLERANCES,
     opt.Q0,
     opt.SIZE_LIMITS,

@@ -235,14 +235,14 @@ PREFER = Option(
     "--prefer limits|manipulability|q0|clearance",
     "preferred solution (default: q0 if present, else limits)",
 )
-SCENE = Option(
+SCENE_FILE = Option(
     "--scene FILE",
     "scene name or YAML file of obstacles (default: none)",
 )
 OBJECT_POSE = Option(
     "--object-pose POSE...", "object in the base frame: x y z [m] roll pitch yaw [rad]"
 )
-SEED = Option("--seed N", "seed of all random numbers", 0, integer(0))
+RANDOM_SEED = Option("--seed N", "seed of all random numbers", 0, integer(0))
 TOLERANCES = (
     Option(
         "--tolerance-position METRES",
@@ -257,17 +257,17 @@ MAX_RESTARTS = Option(
     "--max-rounds N",
     "maximum number of restarts per target (default: adaptive)",
 )
-LIMITS = Option("--limits enforce|ignore", "joint limits; ignore: as in the paper", "enforce")
+LIMIT_MODE = Option("--limits enforce|ignore", "joint limits; ignore: as in the paper", "enforce")
 SOLVER = (
     METHOD,
     Q0,
     PREFER,
-    SCENE,
+    SCENE_FILE,
     OBJECT_POSE,
-    SEED,
+    RANDOM_SEED,
     *TOLERANCES,
     MAX_RESTARTS,
-    LIMITS,
+    LIMIT_MODE,
     Option(
         "--finger-step ipopt|closed-form",
         "finger solver of the papers' methods (default: ipopt)",
@@ -293,7 +293,7 @@ SIZE_LIMITS = Option(
 """Option of every command that reads untrusted files."""
 
 
-def out(metavar: str, text: str, parse: Callable[[str], Any] | None = None) -> Option:
+def out_option(metavar: str, text: str, parse: Callable[[str], Any] | None = None) -> Option:
     """Return a required option ``--out``.
 
     Args:

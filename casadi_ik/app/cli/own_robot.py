@@ -134,8 +134,8 @@ def _draw_description(path: Path, args: Arguments) -> CommandResult:
     check_outputs(outputs, inputs=[path])
     draw, robot = _drawing(), ArmHand(load_description(path))
     draw(robot, args.picture)
-    what = f"{robot.name}: {len(robot.fingers)} pads"
-    return CommandResult.of_parts(True, headline(True, "DRAWN", what), *files(outputs))
+    summary = f"{robot.name}: {len(robot.fingers)} pads"
+    return CommandResult.of_parts(True, headline(True, "DRAWN", summary), *files(outputs))
 
 
 def _command_line(args: Arguments) -> str:
@@ -204,7 +204,9 @@ def _import_report(
             pairs["limits"] = f"assumed, because {source} states none: {limits}"
     for reason in dict.fromkeys(imported.hand.lock_reasons.values()):
         joint_names = ", ".join(
-            name for name, why in imported.hand.lock_reasons.items() if why == reason
+            name
+            for name, lock_reason in imported.hand.lock_reasons.items()
+            if lock_reason == reason
         )
         pairs["locked" if "locked" not in pairs else "locked too"] = f"{joint_names}: {reason}"
     pairs["check"] = "\n".join(
@@ -229,9 +231,9 @@ def _import_report(
         rows.add_row(finger_name, pad.link, str(len(finger_chain.joints)), point, normal)
     chosen_links = [hand.palm_link for hand in imported.hands if hand.reason == "--palm"]
     notes = [
-        f"--palm: {why}"
+        f"--palm: {warning}"
         for link in chosen_links
-        if (why := palm_warning(import_result.files[1], link))
+        if (warning := palm_warning(import_result.files[1], link))
     ]
     notes += imported.notes
     if any(map(is_searched, arms)):
@@ -275,7 +277,7 @@ def _import_report(
         "prior noise of measured angles (default: 0.0175, 1 deg)",
         math.radians(1.0),
     ),
-    opt.out("CALIBRATED.yaml", "output file of the calibrated robot"),
+    opt.out_option("CALIBRATED.yaml", "output file of the calibrated robot"),
 )
 def calibrate(args: Arguments) -> CommandResult:
     """Estimate linkage dimensions, joint axes and contact frames of a robot's hand.
@@ -349,7 +351,7 @@ def _calibration_report(estimate: calibration.Calibration, units: Units) -> list
 
 @command(
     Option("ROBOT", "name listed by `casadi-ik robots`, or YAML file"),
-    opt.out("DIR", "output folder"),
+    opt.out_option("DIR", "output folder"),
     Option("--method M", "method; only hand-first is possible", "hand-first"),
     Option("--prefix NAME", "prefix of all names (default: the robot's name)"),
     Option(
@@ -423,9 +425,9 @@ def compile_ahead(args: Arguments) -> CommandResult:
       casadi-ik compile kuka_lwr_barrett panda+allegro_right
       casadi-ik compile --all kuka_lwr_barrett
 
-    The command compiles the kernels of single solves and batches. With --all it
-    compiles those of scenes, rankings, motions, logs and diagnoses as well, so that
-    no compilation takes place later.
+    The command compiles the kernels of single solves and batches. With --all it also
+    compiles those of scenes, rankings, motions, logs and diagnoses, so that later
+    commands compile nothing.
 
     exit codes: 0 done, 2 bad input
     """

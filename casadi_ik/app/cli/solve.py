@@ -183,15 +183,15 @@ def _drawing(path: Path, grasp: Grasp) -> Callable[..., Any]:
         "treatment of invalid rows, see below",
         "error",
     ),
-    opt.SCENE,
+    opt.SCENE_FILE,
     opt.PREFER,
     opt.Q0,
     Option("--limit N", "maximum number of solutions", 10),
     Option("--per-candidate N", "maximum number of solutions per candidate", 1),
-    opt.SEED,
+    opt.RANDOM_SEED,
     *opt.TOLERANCES,
     opt.MAX_RESTARTS,
-    opt.out("RANKED.json", "output file of the ranked solutions", opt.json_name),
+    opt.out_option("RANKED.json", "output file of the ranked solutions", opt.json_name),
     opt.SIZE_LIMITS,
 )
 def choose(args: Arguments) -> CommandResult:

@@ -57,7 +57,7 @@ COMMANDS = {
     "log info": ("log.info", "summarise the contents of logs"),
     "log solves": ("log.solves", "list solves with their status"),
     "log events": ("log.events", "list events: singularities, limits, stalls, ..."),
-    "log why": ("log.why", "explain one solve in words"),
+    "log why": ("log.explain_solve", "explain one solve in words"),
     "log plot": ("log.plot", "plot the convergence of one solve"),
     "log compare": ("log.compare", "compare two methods on the same targets"),
     "log report": ("log.report", "write a study as an HTML page"),
@@ -118,24 +118,24 @@ class Exit(IntEnum):
     NOT_SOLVED = 1
     """The problem is valid but not solved; the report states the reason."""
     BAD_INPUT = 2
-    """The input is invalid; one line on stderr states where and what was expected."""
+    """The input is invalid; a line on stderr states the location and the expected value."""
     BROKEN_PIPE = 141
     """The reader of stdout closed it (128 + SIGPIPE)."""
 
 
 @dataclass(frozen=True)
 class CommandResult:
-    """Report and exit code of a command that has written all its files.
+    """Report and exit code of a command that has written its files.
 
     Attributes:
         report: Report for stdout; a string is printed unchanged.
         exit: Exit code.
-        after: Function to call once the report is printed, or None.
+        epilogue: Function that is called after the report is printed; None: none.
     """
 
     report: RenderableType
     exit: Exit = Exit.DONE
-    after: Callable[[], None] | None = None
+    epilogue: Callable[[], None] | None = None
 
     @staticmethod
     def of_parts(success: bool, *report: RenderableType) -> CommandResult:

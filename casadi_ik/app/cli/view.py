@@ -24,7 +24,6 @@ from casadi_ik.app.cli.options import Option
 from casadi_ik.app.cli.table import Arguments, CommandResult, command
 from casadi_ik.errors import (
     InputError,
-    LogError,
     MissingExtraError,
     UnknownNameError,
     did_you_mean,
@@ -33,7 +32,7 @@ from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.integrations.datasets import load_candidates
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
-from casadi_ik.logs import RecordedMotion, read_motion
+from casadi_ik.logs import NoMotionError, RecordedMotion, read_motion
 from casadi_ik.logs.solve import SolveRecord, one_solve
 from casadi_ik.solve.solution_files import is_ranked, read_ranked
 
@@ -54,9 +53,9 @@ SOLVE_NUMBERS = opt.word_list(opt.integer(1))
         key="what",
     ),
     opt.ROBOT,
-    opt.SCENE,
+    opt.SCENE_FILE,
     opt.METHOD,
-    opt.LIMITS,
+    opt.LIMIT_MODE,
     *opt.TOLERANCES,
     opt.OBJECT_POSE,
     Option(
@@ -165,11 +164,11 @@ def _is_log(path: Path) -> bool:
 
 def _motion_of(file: str) -> RecordedMotion | None:
     """Read a motion of `reach` or `follow`; return None for a log of solves."""
+    if not Path(file).is_file():
+        return None  # a folder of shards holds solves
     try:
         return read_motion(file)
-    except LogError as error:
-        if Path(file).is_file() and "no motion: found" not in str(error):
-            raise
+    except NoMotionError:
         return None
 
 
@@ -201,8 +200,8 @@ def _kind(name: str) -> str:
     kinds = ("arm_hands", "bodies", "arms", "hands")
     if "+" in name or any(name in shipped_names(kind) for kind in kinds):
         return "robot"
-    known = [entry for kind in ("grasps", *kinds) for entry in shipped_names(kind)]
-    suggestion = did_you_mean(name, known, "expected a shipped name or the path of a file")
+    shipped = [entry for kind in ("grasps", *kinds) for entry in shipped_names(kind)]
+    suggestion = did_you_mean(name, shipped, "expected a shipped name or the path of a file")
     raise UnknownNameError(
         f"{name!r} is neither a shipped grasp (casadi-ik grasps) nor a shipped robot (casadi-ik "
         f"robots); {suggestion}"

@@ -339,8 +339,8 @@ def _draw_hand_pads(figure: Figure, robot: ArmHand, bottom: float, height: float
         point, normal = frame[:3, 3], frame[:3, 0]
         marks.append(Drawable(name, ball(0.014 * size, point), color))
         marks.append(Drawable(name, arrow(point, normal, 0.16 * size, 0.012 * size), color))
-    for left, azimuth in ((0.0, 25.0), (0.5, 115.0)):
-        box = (left, bottom, 0.5, height)
+    for x_offset, azimuth in ((0.0, 25.0), (0.5, 115.0)):
+        box = (x_offset, bottom, 0.5, height)
         pixels = pixel_size(figure, box)
         with render_lock, closing(Scene3D()) as scene3d:
             scene3d.add("hand", hand, orient=robot.description.path is not None)

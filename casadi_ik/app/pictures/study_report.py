@@ -26,13 +26,13 @@ from casadi_ik.logs.solve import one_solve
 from casadi_ik.logs.tables import MethodRows
 
 
-def study_page(log: Log, title: str, most: int) -> str:
+def study_page(log: Log, title: str, max_details: int) -> str:
     """Return a report of a log: totals, failures by reason, and solves to filter and sort.
 
     Args:
         log: The log.
         title: Title of the page.
-        most: Maximum number of solves that are listed with details, the hardest first.
+        max_details: Maximum number of solves that are listed with details, the hardest first.
 
     Returns:
         Self-contained HTML.
@@ -52,7 +52,7 @@ def study_page(log: Log, title: str, most: int) -> str:
         _totals(groups),
     ]
     if count:
-        listed = list(hardest_solves(groups, most))
+        listed = list(hardest_solves(groups, max_details))
         parts += [
             "<h2>Failures by reason</h2>",
             _clusters(groups),
@@ -70,8 +70,8 @@ def study_page(log: Log, title: str, most: int) -> str:
             contact_figure(groups),
         ]
     page = (models_folder() / "viewer" / "report.html").read_text(encoding="utf-8")
-    before, after = page.split("BODY")
-    return before.replace("TITLE", _escape(title)) + "\n".join(parts) + after
+    head, foot = page.split("BODY")
+    return head.replace("TITLE", _escape(title)) + "\n".join(parts) + foot
 
 
 def _totals(groups: Sequence[SolveGroup]) -> str:
@@ -105,7 +105,7 @@ def _total(group: SolveGroup) -> list[str]:
 
 
 def _clusters(groups: Sequence[SolveGroup]) -> str:
-    """Return a table of failures by reason, the most frequent first."""
+    """Return a table of failures by reason, the max_details frequent first."""
     members_by_reason: dict[tuple[str, str], list[tuple[SolveGroup, int]]] = {}
     for group in groups:
         for i in np.flatnonzero(~group.success).tolist():
@@ -130,12 +130,12 @@ def _clusters(groups: Sequence[SolveGroup]) -> str:
     return _table(titles, rows)
 
 
-def _filter(groups: Sequence[SolveGroup], chosen: Sequence[tuple[SolveGroup, int]]) -> str:
+def _filter(groups: Sequence[SolveGroup], listed: Sequence[tuple[SolveGroup, int]]) -> str:
     """Return the form that filters the list of solves."""
     values = {
         "method": [group.method for group in groups],
-        "status": [str(group.status[i]) for group, i in chosen],
-        "reason": [group.reason(i) for group, i in chosen if not group.success[i]],
+        "status": [str(group.status[i]) for group, i in listed],
+        "reason": [group.reason(i) for group, i in listed if not group.success[i]],
     }
     fields = [
         f'<label>{name} <select name="{name}"><option value="">all</option>'
@@ -150,7 +150,7 @@ def _filter(groups: Sequence[SolveGroup], chosen: Sequence[tuple[SolveGroup, int
     )
 
 
-def _solves(log: Log, chosen: Sequence[tuple[SolveGroup, int]]) -> str:
+def _solves(log: Log, listed: Sequence[tuple[SolveGroup, int]]) -> str:
     """Return a table of solves whose details open by a button."""
     titles = ["solve", "method", "targets", "status", "reason"]
     titles += ["iterations", "restarts", "time [µs]", "error / tolerance"]
@@ -160,7 +160,7 @@ def _solves(log: Log, chosen: Sequence[tuple[SolveGroup, int]]) -> str:
         for i, text in enumerate(titles)
     )
     table_bodies = []
-    for group, i in chosen:
+    for group, i in listed:
         number, status = int(group.solve_id[i]) + 1, str(group.status[i])
         reason, kind = ("", "good") if group.success[i] else (group.reason(i), "bad")
         texts = _escape(group.method), _escape(group.name), _escape(status), _escape(reason)
@@ -209,9 +209,9 @@ def _table(titles: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table of HTML cells whose first column is text."""
 
     def line(cells: Iterable[str], tag: str) -> str:
-        first, *others = cells
-        return f'<tr><{tag} class="left">{first}</{tag}>' + "".join(
-            f"<{tag}>{cell}</{tag}>" for cell in others
+        label, *values = cells
+        return f'<tr><{tag} class="left">{label}</{tag}>' + "".join(
+            f"<{tag}>{cell}</{tag}>" for cell in values
         )
 
     lines = "".join(line(row, "td") for row in rows)

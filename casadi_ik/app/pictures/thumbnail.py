@@ -27,7 +27,7 @@ LIGHT_DIRECTION = np.array([0.3, 0.5, 0.81])
 """Direction of the light: right, up and towards the viewer."""
 
 MAX_TRIANGLES = 300
-"""Maximum number of triangles of a body."""
+"""Maximum number of triangles of a drawable."""
 
 
 def thumbnail(robot: ArmHand, q: Array, inches: float = 2.6) -> bytes:
@@ -44,8 +44,11 @@ def thumbnail(robot: ArmHand, q: Array, inches: float = 2.6) -> bytes:
     hand = [body for body in bodies if body.role in ("hand", "pad")]
     figure = Figure((2 * inches, inches), dpi=100)
     FigureCanvasAgg(figure)
-    for left, drawables, view in ((0.0, bodies, overview(palm, close_up)), (0.5, hand, close_up)):
-        axes = figure.add_axes((left, 0.0, 0.5, 1.0), aspect="equal")
+    for x_offset, drawables, view in (
+        (0.0, bodies, overview(palm, close_up)),
+        (0.5, hand, close_up),
+    ):
+        axes = figure.add_axes((x_offset, 0.0, 0.5, 1.0), aspect="equal")
         axes.set_axis_off()
         _draw(axes, drawables, view_axes(view))
     stream = BytesIO()

@@ -1,9 +1,8 @@
 """Servers of pages, and access control.
 
 Host, Origin and token of every request are checked before viser handles it. Browsers send requests
-of any web page, websockets included, to this machine and name the page in `Origin`; a page that
-resolves its own host name to this machine (DNS rebinding) reveals itself in `Host`. viser checks
-neither.
+of any web page, websockets included, to this machine and name the page in `Origin`. A page whose
+host name resolves to this machine (DNS rebinding) is recognisable by `Host`. viser checks neither.
 """
 
 from __future__ import annotations
@@ -267,7 +266,7 @@ class Viewer:
         """Return the scene as a page that needs no server; its camera moves, its content is fixed.
 
         Args:
-            path: File to write as well; None: none.
+            path: File to write; None: none.
             dark: Use the dark theme.
 
         Returns:

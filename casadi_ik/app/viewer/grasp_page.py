@@ -1,4 +1,4 @@
-"""The page on which the object or its contacts are dragged while arm and hand are solved."""
+"""Page on which the object or its contacts are dragged while arm and hand are solved."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from casadi_ik.api import METHODS
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import ground_height, object_drawable, visual_meshes
 from casadi_ik.app.viewer.access import Server
+from casadi_ik.app.viewer.camera import Camera, add_lamp, cameras
 from casadi_ik.app.viewer.candidates import CandidateList, Candidates
+from casadi_ik.app.viewer.comparison import ComparisonView
 from casadi_ik.app.viewer.page import (
     IDLE_DELAY,
     LONG_IDLE_DELAY,
@@ -41,7 +43,7 @@ from casadi_ik.app.viewer.panel import (
     verdict_block,
 )
 from casadi_ik.app.viewer.request import (
-    OBJECT,
+    OBJECT_ITEM,
     PageRequest,
     RequestSolver,
     Settings,
@@ -50,15 +52,13 @@ from casadi_ik.app.viewer.request import (
     request_of,
 )
 from casadi_ik.app.viewer.viser_scene import (
-    Camera,
     ClearanceLine,
     FingertipMarks,
     GhostRobots,
     Handles,
     RobotView,
-    add_lamp,
-    cameras,
     finite_numbers,
+    frames_by_finger,
 )
 from casadi_ik.collision.scene import Scene, load_scene
 from casadi_ik.errors import CasadiIKError
@@ -71,7 +71,7 @@ from casadi_ik.model.targets import LIMIT_MODES
 from casadi_ik.solve.request import CLEARANCE, PREFERENCES
 from casadi_ik.solve.solution import Alternative
 
-LEGEND = (
+GRASP_LEGEND = (
     (palette.TARGET, "target"),
     (palette.MET, "reached"),
     (palette.MISSED, "missed"),
@@ -101,11 +101,11 @@ class GraspPage(InteractivePage):
     """A page with a robot, a grasp and a scene.
 
     Attributes:
-        result: Result shown.
-        solutions: All solutions of the request, as far as they are listed.
+        result: Displayed result.
+        solutions: Solutions of the request; empty until they are listed.
         candidates: Candidate grasps by name.
-        candidate_list: Marks and controls of the candidates; None: there are none.
-        compared_method: Method whose solution is shown beside the robot; "none": none.
+        candidate_list: Marks and controls of the candidates; None without candidates.
+        compared_method: Method whose solution is displayed next to the robot; "none": none.
     """
 
     def __init__(
@@ -126,12 +126,12 @@ class GraspPage(InteractivePage):
             request: Initial request.
             q: (n,) Initial configuration [rad or m].
             candidates: Candidate grasps by name.
-            solve_first: Solve the initial request; otherwise q is checked and shown.
-            dark: Use the dark theme.
+            solve_first: True to solve the initial request; False to check and show q.
+            dark: True for the dark theme.
         """
         self._request_solver = RequestSolver(robot)
         evaluate = self._request_solver.solve if solve_first else self._request_solver.check
-        evaluate(request, q)  # loads the kernels, so that the time of the second call counts
+        evaluate(request, q)  # loads the kernels, which the displayed time excludes
         self.result = evaluate(request, q)
         floor = ground_height(robot, request.scene)
         super().__init__(server, robot, request, request.name or robot.name, floor, dark)
@@ -148,11 +148,11 @@ class GraspPage(InteractivePage):
         self._robot_camera = self.cameras()["Robot"]
         next(iter(self.cameras().values())).show(server)
         add_lamp(server, self._robot_camera)
-        self._drawn = RobotView(server, robot)
+        self._robot_view = RobotView(server, robot)
         self._handles, self._tips = Handles(server, request, self), FingertipMarks(server, request)
         self._closest = ClearanceLine(server)
         self._ghosts = GhostRobots(server, robot)
-        self._comparison: tuple[RobotView, Handles, FingertipMarks] | None = None
+        self._comparison = ComparisonView(server, robot, self._robot_camera)
         self._panel = SettingsPanel(self, self._handles.names)
         self.candidate_list = self._panel.candidates
         self.start(
@@ -160,7 +160,7 @@ class GraspPage(InteractivePage):
             (IDLE_DELAY, self._explain),
             (LONG_IDLE_DELAY, self._list_solutions),
         )
-        initial_selection = OBJECT if OBJECT in self._handles.names else robot.fingers[0]
+        initial_selection = OBJECT_ITEM if OBJECT_ITEM in self._handles.names else robot.fingers[0]
         # Handles would hide the candidates.
         self.select("" if self.candidates else initial_selection)
 
@@ -190,9 +190,9 @@ class GraspPage(InteractivePage):
     def open(
         self, robot: str | None = None, grasp: str | None = None, scene: str | None = None
     ) -> None:
-        """Open another robot, grasp or scene by name; "" is none.
+        """Open another robot, grasp or scene by name; "": none.
 
-        A robot opens with the first of its shipped grasps, or at home.
+        A robot opens with its first shipped grasp, or at home.
         """
         try:
             page = self._new_page(robot, grasp, scene)
@@ -222,7 +222,7 @@ class GraspPage(InteractivePage):
 
     @on_page_thread
     def show_solution(self, index: int) -> None:
-        """Show one of the solutions, counted from 0."""
+        """Show the solution with an index."""
         if index < len(self.solutions):
             solution = self.solutions[index]
             self._is_q_fixed = True
@@ -233,19 +233,19 @@ class GraspPage(InteractivePage):
 
     @on_page_thread
     def show_ghosts(self, visible: bool) -> None:
-        """Show all solutions at once, or only the current one."""
+        """Show all solutions at once, or only the current solution."""
         self._ghosts_visible = visible
         self._draw_ghosts()
 
     @on_page_thread
     def compare(self, method: str) -> None:
-        """Show the solution of another method beside the robot; "none": none."""
+        """Show the solution of another method next to the robot; "none": none."""
         self.compared_method = method
 
     @on_page_thread
     def show_geometry(self, name: str) -> None:
         """Draw the robot by its visual or its collision geometry."""
-        self._drawn.show_geometry(name)
+        self._robot_view.show_geometry(name)
 
     # Called on the worker thread.
 
@@ -286,9 +286,9 @@ class GraspPage(InteractivePage):
 
     def draw(self, result: SolveResult) -> None:
         """Draw a result."""
-        frames = self._frames(result.q)
+        frames = frames_by_finger(self.robot, result.q)
         with self.server.atomic():
-            self._drawn.update(result.q)
+            self._robot_view.update(result.q)
             self._handles.update(self.request, self._dragged)
             self._tips.update(self.request, frames, result.verdicts)
             if self.candidate_list is not None:
@@ -300,11 +300,8 @@ class GraspPage(InteractivePage):
         self.server.flush()
         self._dragged = ""
 
-    def _frames(self, q: Array) -> dict[str, Array]:
-        return dict(zip(self.robot.fingers, self.robot.contact_frames(q), strict=True))
-
     def _explain(self) -> None:
-        """Diagnose a failed solve; this takes too long for a drag."""
+        """Diagnose a failed solve, which takes too long during a drag."""
         if self.result.needs_diagnosis and self.request is self._solved_request:
             self.result = self._request_solver.explain(self.request, self.result.q)
             self.draw(self.result)
@@ -312,11 +309,10 @@ class GraspPage(InteractivePage):
         self._show_comparison()
 
     def _show_comparison(self) -> None:
-        """Show the solution of another method to the right of the robot."""
+        """Show or hide the solution of another method."""
         if self.compared_method == NO_SELECTION:
-            if self._comparison is not None:
-                self.server.scene.remove_by_name("/beside")
-                self._comparison = None
+            if self._comparison.is_visible:
+                self._comparison.hide()
                 self._panel.show_comparison(None)
             return
         settings = replace(self.request.settings, method=self.compared_method)
@@ -325,24 +321,11 @@ class GraspPage(InteractivePage):
             result = self._request_solver.solve(request, self._first_q)
         except CasadiIKError as error:
             result = invalid_result(error, self.result.q)
-        if self._comparison is None:
-            camera, name = self._robot_camera, "/beside"
-            frame = self.server.scene.add_frame(name, show_axes=False)
-            direction = np.array([-camera.view[1], camera.view[0], 0.0])
-            frame.position = 1.6 * camera.radius * direction / np.linalg.norm(direction)
-            self._comparison = (
-                RobotView(self.server, self.robot, f"{name}/robot"),
-                Handles(self.server, replace(request, scene=None), None, name),
-                FingertipMarks(self.server, request, name),
-            )
-        drawn, handles, tips = self._comparison
-        drawn.update(result.q)
-        handles.update(request)
-        tips.update(request, self._frames(result.q), result.verdicts)
+        self._comparison.show(request, result)
         self._panel.show_comparison(result)
 
     def _list_solutions(self) -> None:
-        """List all solutions once nothing moves."""
+        """List all solutions while the page is idle."""
         if self._is_q_fixed or self.request is self._listed_request:
             return
         try:
@@ -358,7 +341,7 @@ class GraspPage(InteractivePage):
         self._draw_ghosts()
 
     def _draw_ghosts(self) -> None:
-        """Draw solutions from red at a limit through yellow to green far from limits."""
+        """Draw solutions in colours from red at a limit to green at a large limit margin."""
         solutions = self.solutions[:MAX_GHOSTS] if self._ghosts_visible else ()
         ghosts = [
             (solution.q, palette.shade(solution.margin, (0.0, 0.15, 0.4))) for solution in solutions
@@ -374,18 +357,18 @@ class GraspPage(InteractivePage):
 @lru_cache(maxsize=1)
 def shipped_robots() -> tuple[str, ...]:
     """Return the names of shipped robots with hands, and of robots of shipped grasps."""
-    of_grasps = {load_grasp(name).robot for name in shipped_names("grasps")}
-    return tuple(sorted(of_grasps.union(shipped_names("arm_hands"), shipped_names("bodies"))))
+    grasp_robots = {load_grasp(name).robot for name in shipped_names("grasps")}
+    return tuple(sorted(grasp_robots.union(shipped_names("arm_hands"), shipped_names("bodies"))))
 
 
 class SettingsPanel:
-    """The panel of the page: verdict, selection, results, settings and files."""
+    """Panel of the page: verdict, selection, results, settings and files."""
 
     def __init__(self, page: GraspPage, names: Sequence[str]) -> None:
         """Build the panel.
 
         Args:
-            page: The page; it receives all changes by the user.
+            page: The page, which handles the changes by the user.
             names: Names of the draggable items.
         """
         self._page, self._gui = page, page.server.gui
@@ -417,11 +400,11 @@ class SettingsPanel:
                 self._slider = gui.add_slider("Solution", 1, 2, 1, 1, disabled=True)
                 on_set(self._slider, lambda number: page.show_solution(int(number) - 1))
                 ghosts = gui.add_checkbox(
-                    "Show all", False, hint="green: far from limits; red: at a limit"
+                    "Show all", False, hint="green: large limit margin; red: at a limit"
                 )
                 on_set(ghosts, page.show_ghosts)
-                self._solution = gui.add_html(block("listed when nothing moves"))
-            gui.add_html(legend(LEGEND))
+                self._solution = gui.add_html(block("listed while the page is idle"))
+            gui.add_html(legend(GRASP_LEGEND))
             self._comparison_html = gui.add_html("")
         with tabs.add_tab("Solve"):
             self._add_settings(page.request.settings, page.request.scene is not None)
@@ -448,7 +431,7 @@ class SettingsPanel:
             self._drag.value = name or NO_SELECTION
 
     def show_solutions(self, solutions: Sequence[Alternative]) -> None:
-        """Show the number of solutions, and the first one."""
+        """Show the number of solutions, and the first solution."""
         self._slider.max = max(len(solutions), 2)
         self._slider.disabled = len(solutions) < 2
         self._slider.value = 1
@@ -474,7 +457,7 @@ class SettingsPanel:
 
     def show_motors(self, q: Array) -> None:
         """Show the positions of motors and joints."""
-        # More digits would not fit into the box.
+        # The box has space for one decimal.
         self._exact_values = q * self._scales
         self._shown_values = np.clip(np.round(self._exact_values, 1), *self._ranges)
         for slider, value in zip(self._motors, self._shown_values.tolist(), strict=True):

@@ -23,10 +23,11 @@ from casadi_ik.app.drawing.drawables import (
 )
 from casadi_ik.app.drawing.surfaces import pose_with_x_axis
 from casadi_ik.app.viewer.access import Server
+from casadi_ik.app.viewer.camera import add_lamp, cameras
 from casadi_ik.app.viewer.page import InteractivePage, on_page_thread
 from casadi_ik.app.viewer.panel import block, legend, on_press, on_set
 from casadi_ik.app.viewer.request import PageRequest, request_of
-from casadi_ik.app.viewer.viser_scene import Handles, RobotView, add_lamp, cameras
+from casadi_ik.app.viewer.viser_scene import Handles, RobotView
 from casadi_ik.errors import CasadiIKError, DescriptionError, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
@@ -93,7 +94,7 @@ class PadPage(InteractivePage):
         camera = next(iter(cameras(robot, robot.home, marks).values()))
         camera.show(server)
         add_lamp(server, camera)
-        self._drawn = RobotView(server, robot, drawables=drawables)
+        self._robot_view = RobotView(server, robot, drawables=drawables)
         self._handles = Handles(server, request, self)
         self._add_panel(writable)
         self.start()
@@ -374,6 +375,6 @@ def surface_hit(surface: IndexedMesh, point: Array, normal: Array) -> tuple[Arra
     neighbours = [neighbour for neighbour in hits if neighbour is not None]
     if len(neighbours) < 4:
         return hit, normal
-    right, up, left, down = neighbours
-    direction = np.cross(right - left, up - down)
+    plus_x, plus_y, minus_x, minus_y = neighbours
+    direction = np.cross(plus_x - minus_x, plus_y - minus_y)
     return hit, direction / np.linalg.norm(direction)

@@ -10,9 +10,9 @@ from functools import partial, wraps
 from typing import Any, Concatenate, ParamSpec
 
 from casadi_ik.app.viewer.access import Server
+from casadi_ik.app.viewer.camera import set_up_scene
 from casadi_ik.app.viewer.panel import on_press
 from casadi_ik.app.viewer.request import PageRequest
-from casadi_ik.app.viewer.viser_scene import set_up_scene
 from casadi_ik.compile.cancellation import CancelledError, cancellable
 from casadi_ik.errors import shortened
 from casadi_ik.files.arrays import Array

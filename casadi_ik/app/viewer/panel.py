@@ -217,7 +217,8 @@ def copyable_text(text: str) -> str:
 
 # Charts as SVG.
 
-WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 340, 118, 40, 334, 8, 102
+CHART_WIDTH, CHART_HEIGHT = 340, 118
+AXES_LEFT, AXES_RIGHT, AXES_TOP, AXES_BOTTOM = 40, 334, 8, 102
 """Size of a chart, and the edges of its axes [SVG units]."""
 
 
@@ -257,10 +258,14 @@ def chart(
     duration = max(float(times[-1] - times[0]), 1e-9)
 
     def x(time: ArrayLike) -> Array:
-        return LEFT + np.clip((np.asarray(time) - times[0]) / duration, 0, 1) * (RIGHT - LEFT)
+        return AXES_LEFT + np.clip((np.asarray(time) - times[0]) / duration, 0, 1) * (
+            AXES_RIGHT - AXES_LEFT
+        )
 
     def y(value: ArrayLike) -> Array:
-        return BOTTOM - np.clip((transform(value) - low) / (high - low), 0, 1) * (BOTTOM - TOP)
+        return AXES_BOTTOM - np.clip((transform(value) - low) / (high - low), 0, 1) * (
+            AXES_BOTTOM - AXES_TOP
+        )
 
     def path(line: Array, color: str) -> str:
         # Long lines are reduced to the maximum of neighbouring points.
@@ -277,22 +282,22 @@ def chart(
         style = 'fill="none" stroke-width="1.6" stroke-linejoin="round" stroke-linecap="round"'
         return f'<path d="{" ".join(moves)}h0" stroke="{color}" {style}/>' if moves else ""
 
-    def across(value: float, style: str) -> str:
-        return f'<path d="M{LEFT} {float(y(value)):.1f}H{RIGHT}" {style}/>'
+    def horizontal_line(value: float, style: str) -> str:
+        return f'<path d="M{AXES_LEFT} {float(y(value)):.1f}H{AXES_RIGHT}" {style}/>'
 
     parts = [
-        f'<rect x="{a:.1f}" y="{TOP}" width="{max(b - a, 1.0):.1f}" height="{BOTTOM - TOP}" '
-        f'fill="{color}" fill-opacity="0.55"/>'
+        f'<rect x="{a:.1f}" y="{AXES_TOP}" width="{max(b - a, 1.0):.1f}" '
+        f'height="{AXES_BOTTOM - AXES_TOP}" fill="{color}" fill-opacity="0.55"/>'
         for a, b, color in ((*x([start, end]), color) for start, end, color in bands)
     ]
     for value in ticks:
-        anchor = f'x="{LEFT - 4}" y="{float(y(value)) + 3:.1f}" text-anchor="end"'
+        anchor = f'x="{AXES_LEFT - 4}" y="{float(y(value)) + 3:.1f}" text-anchor="end"'
         parts.append(
-            across(value, f'stroke="{TRACK_COLOR}"')
+            horizontal_line(value, f'stroke="{TRACK_COLOR}"')
             + f"<text {anchor}>{value:{'.0f' if linear else '.3g'}}</text>"
         )
     if tolerance is not None:
-        parts.append(across(tolerance, f'stroke="{palette.FAINT}" stroke-dasharray="4 3"'))
+        parts.append(horizontal_line(tolerance, f'stroke="{palette.FAINT}" stroke-dasharray="4 3"'))
     names = []
     for i, (name, line) in enumerate(lines.items()):
         color = palette.LINE_COLORS[i % len(palette.LINE_COLORS)]
@@ -302,14 +307,16 @@ def chart(
             f'<span style="margin-right:0.8em;white-space:nowrap"><span style="color:{color}">━'
             f"</span> {html.escape(name)} <b>{value}</b></span> "
         )
-    cursor = f'd="M{float(x(times[row])):.1f} {TOP}V{BOTTOM}" stroke-width="1.6"'
+    cursor = f'd="M{float(x(times[row])):.1f} {AXES_TOP}V{AXES_BOTTOM}" stroke-width="1.6"'
     parts.append(f'<path class="ik-now" {cursor} stroke="{palette.FAINT}"/>')
-    parts.append(f'<text x="{LEFT}" y="{HEIGHT - 4}">{times[0]:.3g}</text>')
-    parts.append(f'<text x="{RIGHT}" y="{HEIGHT - 4}" text-anchor="end">{times[-1]:.3g}</text>')
+    parts.append(f'<text x="{AXES_LEFT}" y="{CHART_HEIGHT - 4}">{times[0]:.3g}</text>')
+    parts.append(
+        f'<text x="{AXES_RIGHT}" y="{CHART_HEIGHT - 4}" text-anchor="end">{times[-1]:.3g}</text>'
+    )
     style = f"width:100%;display:block;font-size:9px;fill:{palette.FAINT}"
     return block(
         f"<div><b>{html.escape(title)}</b></div>"
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" style="{style}">{"".join(parts)}</svg>'
+        f'<svg viewBox="0 0 {CHART_WIDTH} {CHART_HEIGHT}" style="{style}">{"".join(parts)}</svg>'
         f"<div>{''.join(names)}</div>",
         0.72,
         "margin-bottom:0.45em",

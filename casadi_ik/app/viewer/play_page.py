@@ -13,6 +13,7 @@ import numpy as np
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import ground_height
 from casadi_ik.app.viewer.access import Server
+from casadi_ik.app.viewer.camera import add_lamp, cameras
 from casadi_ik.app.viewer.page import Page, on_page_thread
 from casadi_ik.app.viewer.panel import (
     block,
@@ -24,7 +25,7 @@ from casadi_ik.app.viewer.panel import (
     verdict_rows,
 )
 from casadi_ik.app.viewer.request import PageRequest, request_of
-from casadi_ik.app.viewer.viser_scene import FingertipMarks, Handles, RobotView, add_lamp, cameras
+from casadi_ik.app.viewer.viser_scene import FingertipMarks, Handles, RobotView
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, LogError
 from casadi_ik.files.arrays import Array
@@ -38,7 +39,7 @@ from casadi_ik.solve.verdict import ContactVerdict
 FRAME_RATE = 20.0
 """Frames per second during playback."""
 
-LEGEND = (
+PLAYBACK_LEGEND = (
     (palette.TARGET, "target"),
     (palette.MET, "within tolerance"),
     (palette.MISSED, "out of tolerance"),
@@ -359,9 +360,9 @@ class PlayPage(Page):
         """Draw the current time."""
         summaries, charts = [], []
         with self.server.atomic():
-            for playback, (drawn, tips) in zip(self.playbacks, self._views, strict=True):
+            for playback, (robot_view, tips) in zip(self.playbacks, self._views, strict=True):
                 row = playback.row_of(self.time_shown)
-                drawn.update(playback.q[row])
+                robot_view.update(playback.q[row])
                 frames = playback.robot.contact_frames(playback.q[row])
                 by_finger = dict(zip(playback.robot.fingers, frames, strict=True))
                 tips.update(playback.request, by_finger, playback.verdicts(row))
@@ -376,13 +377,13 @@ class PlayPage(Page):
         name = f"/track_{number}"
         frame = self.server.scene.add_frame(name, show_axes=False)
         frame.position = self._lateral_offset(number)
-        drawn = RobotView(self.server, playback.robot, f"{name}/robot")
+        robot_view = RobotView(self.server, playback.robot, f"{name}/robot")
         Handles(self.server, replace(playback.request, scene=self._scene), None, name)
         if len(self.playbacks) > 1:
             self.server.scene.add_label(
                 f"{name}/label", playback.label, position=(0.0, 0.0, 0.02), anchor="top-center"
             )
-        return drawn, FingertipMarks(self.server, playback.request, name)
+        return robot_view, FingertipMarks(self.server, playback.request, name)
 
     def _lateral_offset(self, number: int) -> Array:
         """Return the position of a robot next to the other one."""
@@ -409,7 +410,7 @@ class PlayPage(Page):
         self._speed = gui.add_dropdown("Speed", tuple(speeds), initial_value=list(speeds)[is_solve])
         self._summary, self._charts = gui.add_html(""), gui.add_html("")
         if any(playback.request.contacts for playback in self.playbacks):
-            gui.add_html(legend(LEGEND))
+            gui.add_html(legend(PLAYBACK_LEGEND))
         self.add_theme_switch()
         on_set(self._slider, lambda time: self.show(float(time)))
         on_press(self._button, lambda _: self.play(not self._play_event.is_set()))

@@ -23,7 +23,7 @@ from casadi_ik.solve.solution import Alternative, Solution
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.verdict import ContactVerdict, judge
 
-OBJECT = "object"
+OBJECT_ITEM = "object"
 """Name of the object among the draggable items."""
 
 NOT_MET = "NOT MET"
@@ -112,7 +112,7 @@ class PageRequest:
         """(4, 4) Poses by name of contacts, the object and scene items."""
         poses = {finger: contact.control for finger, contact in self.contacts.items()}
         if self.object_pose is not None:
-            poses[OBJECT] = self.object_pose
+            poses[OBJECT_ITEM] = self.object_pose
         items = {} if self.scene is None else self.scene.items
         return {name: item.pose for name, item in items.items()} | poses
 
@@ -124,7 +124,7 @@ class PageRequest:
         """
         if name in self.contacts:
             return self._with_contact(name, replace(self.contacts[name], control=pose))
-        if name != OBJECT or self.object_pose is None:
+        if name != OBJECT_ITEM or self.object_pose is None:
             return replace(self, scene=(self.scene or Scene()).moved(name, pose))
         displacement = pose @ inverse(self.object_pose)
         contacts = {

@@ -1,1 +1,1 @@
-"""Qiu & Kermani 2021: thumb first, then the closed chain of arm and thumb; and what it beats."""
+"""Qiu & Kermani 2021: thumb first, then the closed chain of arm and thumb, and its baselines."""

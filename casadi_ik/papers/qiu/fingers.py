@@ -47,7 +47,7 @@ class PlanarFinger:
 
     Attributes:
         name: Name of the finger.
-        spread: Index in q of the spread actuator, or None.
+        spread_motor: Index in q of the spread actuator, or None.
         ratio: Spread joint angle per unit of its actuator.
         offset: Spread joint angle at actuator zero [rad].
         spread_limits: (2,) limits of the spread joint [rad]; zeros without spread.
@@ -62,7 +62,7 @@ class PlanarFinger:
     """
 
     name: str
-    spread: int | None
+    spread_motor: int | None
     ratio: float
     offset: float
     spread_limits: Array
@@ -116,7 +116,7 @@ def planar_finger(robot: RobotDescription, name: str) -> PlanarFinger:
     index, ratio, offset = _spread_actuator(robot, spread_joint, context)
     return PlanarFinger(
         name=name,
-        spread=index,
+        spread_motor=index,
         ratio=ratio,
         offset=offset,
         spread_limits=np.array(
@@ -340,8 +340,8 @@ def finger_step_function(robot: RobotDescription, solver: str) -> ca.Function:
         else:
             first, second = closed_form(demand)
         entries[finger.flexion[0]], entries[finger.flexion[1]] = first, second
-        if finger.spread is not None:
-            entries[finger.spread] = (demand.spread_angle - finger.offset) / finger.ratio
+        if finger.spread_motor is not None:
+            entries[finger.spread_motor] = (demand.spread_angle - finger.offset) / finger.ratio
     return ca.Function(
         "finger_step",
         [q, points, normals],
@@ -375,11 +375,11 @@ def _spreads(
 ) -> list[Expr]:
     """Return the spread angle of every finger; fingers on one motor share one angle."""
     angles: dict[int, Expr] = {}
-    for motor in {finger.spread for finger in fingers if finger.spread is not None}:
+    for motor in {finger.spread_motor for finger in fingers if finger.spread_motor is not None}:
         total, weights = CURRENT_SPREAD_WEIGHT * q[motor], CURRENT_SPREAD_WEIGHT
         lower, upper = _spread_range(robot, fingers, motor)
         for finger, goal in zip(fingers, local, strict=True):
-            if finger.spread == motor:
+            if finger.spread_motor == motor:
                 middle = float(finger.spread_limits.mean())
                 azimuth = ca.atan2(finger.facing * goal.normal[1], finger.facing * goal.normal[0])
                 angle = middle + wrap(azimuth - middle)
@@ -388,7 +388,9 @@ def _spreads(
                 weights += weight
         angles[motor] = clamp(total / weights, lower, upper)
     return [
-        0.0 if finger.spread is None else finger.ratio * angles[finger.spread] + finger.offset
+        0.0
+        if finger.spread_motor is None
+        else finger.ratio * angles[finger.spread_motor] + finger.offset
         for finger in fingers
     ]
 
@@ -399,7 +401,7 @@ def _spread_range(
     """Return limits of a spread motor that keep it and all its joints within their limits."""
     lower, upper = float(robot.lower[motor]), float(robot.upper[motor])
     for finger in fingers:
-        if finger.spread == motor:
+        if finger.spread_motor == motor:
             limits = (finger.spread_limits - finger.offset) / finger.ratio
             lower, upper = max(lower, float(limits.min())), min(upper, float(limits.max()))
     return lower, upper

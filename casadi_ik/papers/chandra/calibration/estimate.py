@@ -110,7 +110,7 @@ class Calibration:
             orientation was measured.
         noise_estimated: True if the noise is estimated, False if it is the assumed noise because of
             too few data.
-        before: (m, 2) errors of the description: distance [m] and angle [rad, NaN].
+        before: (m, 2) errors of the initial description: distance [m] and angle [rad, NaN].
         after: (m, 2) errors of the estimate.
         iterations: Number of Gauss-Newton steps.
         converged: True if the last step was small enough.
@@ -208,7 +208,7 @@ def calibrate(
     fit = _Fit(model, measurements, LOSSES[loss])
     noise = np.array([sigma_position, sigma_angle])
     x = np.zeros(len(model.parameters))
-    before, _ = fit.misfit(x)
+    initial_errors, _ = fit.misfit(x)
     estimated = fit.enough()
     converged, steps = False, 0
     while not converged and steps < SETTINGS.max_iterations:
@@ -218,7 +218,7 @@ def calibrate(
         converged = bool(np.abs(step).max() < SETTINGS.smallest_step)
         converged = converged and bool(np.allclose(noise, last, rtol=1e-4))
         steps += 1
-    return fit.result(x, noise, estimated, before, steps, converged)
+    return fit.result(x, noise, estimated, initial_errors, steps, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,8 +239,8 @@ class _Fit:
             rows = measurements.rows(finger)
             residuals = model.misfit(finger, measurements.q[rows], values, measurements.poses[rows])
             errors[rows], jacobians[rows] = residuals[0], residuals[1] * model.prior
-        errors[~measurements.turned, 3:] = 0.0
-        jacobians[~measurements.turned, 3:] = 0.0
+        errors[~measurements.has_orientation, 3:] = 0.0
+        jacobians[~measurements.has_orientation, 3:] = 0.0
         return errors, jacobians
 
     def step(self, x: Array, noise: Array) -> Array:
@@ -263,7 +263,7 @@ class _Fit:
     def whitened(self, errors: Array, noise: Array) -> tuple[Array, Array, Array]:
         """Return errors over the noise (m, 6), their root mean squares (m,) and numbers (m,)."""
         white = errors / _noise_by_component(noise)
-        numbers = np.where(self.measurements.turned, 6.0, 3.0)
+        numbers = np.where(self.measurements.has_orientation, 6.0, 3.0)
         return white, np.sqrt((white**2).sum(axis=1) / numbers), numbers
 
     def enough(self) -> bool:
@@ -281,7 +281,7 @@ class _Fit:
         _, rho, _ = self.whitened(errors, noise)
         singular_values, _ = self._singular_directions(jacobians, noise, self.loss.weight(rho))
         free = 1 - _effective_parameters(singular_values) / self._rows()
-        has_angle = self.measurements.turned
+        has_angle = self.measurements.has_orientation
         position = np.median((errors[:, :3] ** 2).sum(axis=1))
         estimate = [math.sqrt(position / CHI_SQUARE_MEDIAN / free), float(noise[1])]
         if has_angle.any():
@@ -292,7 +292,7 @@ class _Fit:
 
     def _rows(self) -> int:
         """Return the number of measured values."""
-        return int(np.where(self.measurements.turned, 6, 3).sum())
+        return int(np.where(self.measurements.has_orientation, 6, 3).sum())
 
     def _singular_directions(
         self, jacobians: Array, noise: Array, weights: Array
@@ -306,7 +306,13 @@ class _Fit:
         ), directions
 
     def result(
-        self, x: Array, noise: Array, estimated: bool, before: Array, steps: int, converged: bool
+        self,
+        x: Array,
+        noise: Array,
+        estimated: bool,
+        initial_errors: Array,
+        steps: int,
+        converged: bool,
     ) -> Calibration:
         """Return the calibration; `estimated` is True if the noise is estimated."""
         errors, jacobians = self.misfit(x)
@@ -329,7 +335,7 @@ class _Fit:
         inner = information(share) + eye
         prior = self.model.prior
         covariance = np.outer(prior, prior) * (outer @ inner @ outer)
-        has_angle = self.measurements.turned
+        has_angle = self.measurements.has_orientation
         return Calibration(
             parameters=self.model.parameters,
             values=self.model.nominal + prior * x,
@@ -339,7 +345,7 @@ class _Fit:
             weights=weights,
             noise=(float(noise[0]), float(noise[1]) if has_angle.any() else math.nan),
             noise_estimated=estimated,
-            before=_error_norms(before, has_angle),
+            before=_error_norms(initial_errors, has_angle),
             after=_error_norms(errors, has_angle),
             iterations=steps,
             converged=converged,

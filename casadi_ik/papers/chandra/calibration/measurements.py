@@ -40,13 +40,13 @@ class Measurements:
         fingers: (m,) name of the finger of each row.
         q: (m, n) actuator positions; home for actuators that do not move the finger [rad or m].
         poses: (m, 8) unit dual quaternions of the contact frames in the base frame.
-        turned: (m,) True if the orientation was also measured.
+        has_orientation: (m,) True if the orientation was also measured.
     """
 
     fingers: tuple[str, ...]
     q: Array
     poses: Array
-    turned: NDArray[np.bool_]
+    has_orientation: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.fingers)
@@ -110,7 +110,7 @@ def write_measurements(measurements: Measurements, robot: RobotDescription, path
             measurements.fingers,
             measurements.q,
             measurements.poses,
-            measurements.turned,
+            measurements.has_orientation,
             strict=True,
         )
         for finger, q, pose, has_orientation in rows:
