@@ -1,185 +1,197 @@
-/* Palms and hands whose fingertips touch an object, found by hashing oriented pairs of points.
+/* Hands whose fingertips touch an object, by geometric hashing of oriented point pairs.
  *
- * A pair of patches of the object and a pair of fingertips of the same cell give a palm in closed
- * form (B. Drost et al., Model globally, match locally, 2010); further fingers take any posture of
- * the table that touches, or one that is clear. Capsules keep clear of distances in grids: what is
- * given here is looked at exactly afterwards. Numbers are drawn from job->seed alone.
+ * A pair of patches of the object and a pair of fingertips in the same cell of the hash table
+ * determine the palm pose in closed form (B. Drost et al., Model globally, match locally, 2010).
+ * Further fingers take a posture of the table that touches, or a collision-free one. Collisions are
+ * checked with distance grids, so results require an exact check afterwards. All random numbers
+ * follow from job->seed.
  */
 #include <math.h>
 
-enum { X, Y, Z, MOST_FINGERS = 8, MOST_WORDS = 32 };
+enum { X, Y, Z, MAX_FINGERS = 8, MAX_WORDS = 32 };
 
-/* Products of two sines below which two pads face along their line, and tell no turn about it. */
-#define ACROSS 0.02
-#define TURN 6.283185307179586
+/* Sum of products of sines below which both normals are parallel to the line between the pads, so
+ * that they do not determine the rotation about it. */
+#define MIN_SINES 0.02
+#define FULL_TURN 6.283185307179586
 
-/* What a capsule advances by at least where it is near something [m]. */
-#define LEAST_STEP 2e-3
+/* Minimum step along the axis of a capsule in a distance check [m]. */
+#define MIN_STEP 2e-3
 
-static uint64_t drawn(touch_job *job) { /* S. Vigna's splitmix64 */
+static uint64_t random_bits(touch_job *job) { /* S. Vigna's splitmix64 */
   uint64_t z = (uint64_t) (job->seed += (int64_t) 0x9E3779B97F4A7C15u);
   z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9u;
   z = (z ^ (z >> 27)) * 0x94D049BB133111EBu;
   return z ^ (z >> 31);
 }
 
-static scalar chance(touch_job *job) { return (scalar) (drawn(job) >> 11) * 0x1p-53; }
+static scalar random_fraction(touch_job *job) { return (scalar) (random_bits(job) >> 11) * 0x1p-53; }
 
-static int64_t below(touch_job *job, int64_t count) {
-  return (int64_t) (chance(job) * (scalar) count);
+static int64_t random_index(touch_job *job, int64_t count) {
+  return (int64_t) (random_fraction(job) * (scalar) count);
 }
 
 static scalar dot(const scalar *a, const scalar *b) {
   return a[X] * b[X] + a[Y] * b[Y] + a[Z] * b[Z];
 }
 
-static void cross(const scalar *a, const scalar *b, scalar *found) {
-  found[X] = a[Y] * b[Z] - a[Z] * b[Y];
-  found[Y] = a[Z] * b[X] - a[X] * b[Z];
-  found[Z] = a[X] * b[Y] - a[Y] * b[X];
+static void cross(const scalar *a, const scalar *b, scalar *product) {
+  product[X] = a[Y] * b[Z] - a[Z] * b[Y];
+  product[Y] = a[Z] * b[X] - a[X] * b[Z];
+  product[Z] = a[X] * b[Y] - a[Y] * b[X];
 }
 
-static void unit(scalar *a) {
-  const scalar over = 1 / sqrt(dot(a, a) + 1e-300);
+static void normalise(scalar *a) {
+  const scalar inverse = 1 / sqrt(dot(a, a) + 1e-300);
   int k;
-  for (k = 0; k < 3; ++k) a[k] *= over;
+  for (k = 0; k < 3; ++k) a[k] *= inverse;
 }
 
-/* A vector in the object's frame; the palm is its rotation row by row and its origin. */
-static void turned(const scalar *palm, const scalar *a, scalar *found) {
+/* Rotate a vector from the palm frame to the object frame. `palm` is a rotation row by row and an
+ * origin. */
+static void rotate(const scalar *palm, const scalar *a, scalar *rotated) {
   int k;
-  for (k = 0; k < 3; ++k) found[k] = dot(palm + 3 * k, a);
+  for (k = 0; k < 3; ++k) rotated[k] = dot(palm + 3 * k, a);
 }
 
-static void placed(const scalar *palm, const scalar *a, scalar *found) {
+/* Transform a point from the palm frame to the object frame. */
+static void transform(const scalar *palm, const scalar *a, scalar *transformed) {
   int k;
-  for (k = 0; k < 3; ++k) found[k] = dot(palm + 3 * k, a) + palm[9 + k];
+  for (k = 0; k < 3; ++k) transformed[k] = dot(palm + 3 * k, a) + palm[9 + k];
 }
 
-/* Cell of a point, -1 beyond the grid. */
+/* Return the index of the cell of a point, -1 outside the grid. */
 static int64_t cell_of(const scalar *low, const int64_t *count, const scalar *p) {
   int64_t cell = 0;
   int k;
   for (k = 0; k < 3; ++k) {
-    const scalar at = (p[k] - low[k]) / low[3];
-    if (!(at >= 0 && at < (scalar) count[k])) return -1;
-    cell = cell * count[k] + (int64_t) at;
+    const scalar position = (p[k] - low[k]) / low[3];
+    if (!(position >= 0 && position < (scalar) count[k])) return -1;
+    cell = cell * count[k] + (int64_t) position;
   }
   return cell;
 }
 
-/* What is free about a point beyond a distance to what a grid tells of. Of points beyond the middles
- * of its outer cells it is their distance from these: what is farther away is not known. */
-static scalar free_about(const scalar *low, const int64_t *count, const scalar *value,
+/* Return the clearance of a point beyond a required distance, by trilinear interpolation in a grid.
+ * Outside the centres of the border cells, return the distance from these: solids may be anywhere
+ * beyond the grid. */
+static scalar clearance_at(const scalar *low, const int64_t *count, const scalar *value,
                          const scalar *p, scalar distance) {
   int64_t cell[3];
-  scalar part[3], lower, upper, beyond = -1;
+  scalar fraction[3], lower, upper, outside = -1;
   const scalar *v;
   int k;
   for (k = 0; k < 3; ++k) {
-    const scalar at = (p[k] - low[k]) / low[3] - 0.5, over = at - (scalar) (count[k] - 1);
-    beyond = -at > beyond ? -at : beyond;
-    beyond = over > beyond ? over : beyond;
-    cell[k] = (int64_t) at;
-    part[k] = at - (scalar) cell[k];
+    const scalar position = (p[k] - low[k]) / low[3] - 0.5;
+    const scalar excess = position - (scalar) (count[k] - 1);
+    outside = -position > outside ? -position : outside;
+    outside = excess > outside ? excess : outside;
+    cell[k] = (int64_t) position;
+    fraction[k] = position - (scalar) cell[k];
   }
-  if (beyond >= 0) return beyond * low[3];
+  if (outside >= 0) return outside * low[3];
   const int64_t row = count[Z], plane = count[Y] * row;
   v = value + cell[X] * plane + cell[Y] * row + cell[Z];
-#define ALONG(i) (v[i] + part[Z] * (v[(i) + 1] - v[i]))
-  lower = ALONG(0) + part[Y] * (ALONG(row) - ALONG(0));
-  upper = ALONG(plane) + part[Y] * (ALONG(plane + row) - ALONG(plane));
-#undef ALONG
-  return lower + part[X] * (upper - lower) - distance;
+#define ALONG_Z(i) (v[i] + fraction[Z] * (v[(i) + 1] - v[i]))
+  lower = ALONG_Z(0) + fraction[Y] * (ALONG_Z(row) - ALONG_Z(0));
+  upper = ALONG_Z(plane) + fraction[Y] * (ALONG_Z(plane + row) - ALONG_Z(plane));
+#undef ALONG_Z
+  return lower + fraction[X] * (upper - lower) - distance;
 }
 
-/* Whether a segment keeps a distance to what a grid tells of: walked by what is free about it. */
-static int keeps(const scalar *low, const int64_t *count, const scalar *value, const scalar *start,
-                 const scalar *way, scalar length, scalar distance) {
+/* Return 1 if a segment keeps a distance from the solids of a grid: the check advances by the
+ * clearance at each point. */
+static int keeps_distance(const scalar *low, const int64_t *count, const scalar *value,
+                          const scalar *start, const scalar *vector, scalar length, scalar distance) {
   scalar t = 0;
   if (!(distance > -INFINITY)) return 1;
   for (;;) {
-    const scalar part = length > 0 ? t / length : 0;
-    const scalar p[3] = {start[X] + part * way[X], start[Y] + part * way[Y],
-                         start[Z] + part * way[Z]};
-    const scalar free = free_about(low, count, value, p, distance);
-    if (free < 0) return 0;
-    if (t >= length || t + free > length) return 1;
-    t += free > LEAST_STEP ? free : LEAST_STEP;
+    const scalar fraction = length > 0 ? t / length : 0;
+    const scalar p[3] = {start[X] + fraction * vector[X], start[Y] + fraction * vector[Y],
+                         start[Z] + fraction * vector[Z]};
+    const scalar clearance = clearance_at(low, count, value, p, distance);
+    if (clearance < 0) return 0;
+    if (t >= length || t + clearance > length) return 1;
+    t += clearance > MIN_STEP ? clearance : MIN_STEP;
     if (t > length) t = length;
   }
 }
 
-/* Whether capsules [from, to) keep clear of the object and of what stands about it. */
-static int clear_of_all(const touch_job *job, const scalar *palm, const scalar *capsules,
-                        int64_t from, int64_t to, int64_t shift, int touches) {
+/* Return 1 if capsules [from, to) are free of collision with the object and the scene. `shift` is
+ * added to their indices in job->lengths; with `touches`, pads may touch the object. */
+static int capsules_are_free(const touch_job *job, const scalar *palm, const scalar *capsules,
+                             int64_t from, int64_t to, int64_t shift, int touches) {
   int64_t i;
   for (i = from; i < to; ++i) {
-    const int64_t number = i + shift;
-    scalar start[3], way[3];
-    placed(palm, capsules + 6 * i, start);
-    turned(palm, capsules + 6 * i + 3, way);
-    if (!(touches && job->pads[number])
-        && !keeps(job->object_low, job->object_count, job->object_value, start, way,
-                  job->lengths[number], job->off_object[number])) return 0;
-    if (!keeps(job->scene_low, job->scene_count, job->scene_value, start, way,
-               job->lengths[number], job->off_scene[number])) return 0;
+    const int64_t index = i + shift;
+    scalar start[3], vector[3];
+    transform(palm, capsules + 6 * i, start);
+    rotate(palm, capsules + 6 * i + 3, vector);
+    if (!(touches && job->may_touch[index])
+        && !keeps_distance(job->object_low, job->object_count, job->object_value, start, vector,
+                           job->lengths[index], job->object_standoffs[index])) return 0;
+    if (!keeps_distance(job->scene_low, job->scene_count, job->scene_value, start, vector,
+                        job->lengths[index], job->scene_standoffs[index])) return 0;
   }
   return 1;
 }
 
-static int finger_clear(const touch_job *job, const scalar *palm, int64_t share, int64_t finger,
+static int finger_is_free(const touch_job *job, const scalar *palm, int64_t share, int64_t finger,
                         int64_t posture, int touches) {
   const scalar *capsules = job->capsules + 6 * job->n_capsules * (share * job->postures + posture);
-  return clear_of_all(job, palm, capsules, job->first[finger], job->first[finger + 1], 0, touches);
+  return capsules_are_free(job, palm, capsules, job->first[finger], job->first[finger + 1], 0, touches);
 }
 
-static const scalar *pad(const touch_job *job, const scalar *from, int64_t share, int64_t finger,
+/* Return the vector of a pad in `vectors`, which is job->points or job->normals. */
+static const scalar *pad(const touch_job *job, const scalar *vectors, int64_t share, int64_t finger,
                          int64_t posture) {
-  return from + 3 * ((share * job->postures + posture) * job->n_fingers + finger);
+  return vectors + 3 * ((share * job->postures + posture) * job->n_fingers + finger);
 }
 
-static uint64_t *bits(const touch_job *job, int64_t share, int64_t one, int64_t other,
-                      int64_t posture) {
-  const int64_t row = (share * job->n_fingers + one) * job->n_fingers + other;
-  return job->apart + (row * job->postures + posture) * job->words;
+/* Return the bit set of the postures of the second finger that do not collide with a posture of the
+ * first. */
+static uint64_t *separate_postures(const touch_job *job, int64_t share, int64_t first, int64_t second,
+                                   int64_t posture) {
+  const int64_t row = (share * job->n_fingers + first) * job->n_fingers + second;
+  return job->separate + (row * job->postures + posture) * job->words;
 }
 
-/* Axes whose last is along a line, the first across it. */
+/* Complete a unit vector along a line to a right-handed frame (x, y, line). */
 static void axes_about(const scalar *line, scalar *x, scalar *y) {
   const scalar size[3] = {fabs(line[X]), fabs(line[Y]), fabs(line[Z])};
-  const int least = size[X] <= size[Y] ? (size[X] <= size[Z] ? X : Z) : (size[Y] <= size[Z] ? Y : Z);
-  scalar other[3] = {0, 0, 0};
-  other[least] = 1;
-  cross(line, other, x);
-  unit(x);
+  const int smallest = size[X] <= size[Y] ? (size[X] <= size[Z] ? X : Z) : (size[Y] <= size[Z] ? Y : Z);
+  scalar axis[3] = {0, 0, 0};
+  axis[smallest] = 1;
+  cross(line, axis, x);
+  normalise(x);
   cross(line, x, y);
 }
 
-/* The palm that brings two points with normals onto two others; the turn about their line is that
- * which brings the parts of both normals across it together, or any where pads face along it. */
+/* Compute the palm pose that aligns points a, b with normals na, nb to points p, q with normals np,
+ * nq. The rotation about the line through the points aligns the components of the normals orthogonal
+ * to the line; it is random if the normals are parallel to the line. */
 static void match(touch_job *job, const scalar *a, const scalar *b, const scalar *na, const scalar *nb,
                   const scalar *p, const scalar *q, const scalar *np, const scalar *nq, scalar *palm) {
-  scalar from[3][3], to[3][3], cosine, sine, over, mean[3], goal[3];
+  scalar from[3][3], to[3][3], cosine, sine, norm, mean[3], goal[3];
   int i, k;
   for (k = 0; k < 3; ++k) from[2][k] = b[k] - a[k];
   for (k = 0; k < 3; ++k) to[2][k] = q[k] - p[k];
-  unit(from[2]);
-  unit(to[2]);
+  normalise(from[2]);
+  normalise(to[2]);
   axes_about(from[2], from[0], from[1]);
   axes_about(to[2], to[0], to[1]);
   cosine = dot(from[0], na) * dot(to[0], np) + dot(from[1], na) * dot(to[1], np)
          + dot(from[0], nb) * dot(to[0], nq) + dot(from[1], nb) * dot(to[1], nq);
   sine = dot(from[0], na) * dot(to[1], np) - dot(from[1], na) * dot(to[0], np)
        + dot(from[0], nb) * dot(to[1], nq) - dot(from[1], nb) * dot(to[0], nq);
-  over = sqrt(cosine * cosine + sine * sine);
-  if (over > ACROSS) {
-    cosine /= over;
-    sine /= over;
+  norm = sqrt(cosine * cosine + sine * sine);
+  if (norm > MIN_SINES) {
+    cosine /= norm;
+    sine /= norm;
   } else {
-    const scalar turn = TURN * chance(job);
-    cosine = cos(turn);
-    sine = sin(turn);
+    const scalar angle = FULL_TURN * random_fraction(job);
+    cosine = cos(angle);
+    sine = sin(angle);
   }
   for (k = 0; k < 3; ++k) {
     const scalar x = cosine * to[0][k] + sine * to[1][k], y = cosine * to[1][k] - sine * to[0][k];
@@ -187,17 +199,21 @@ static void match(touch_job *job, const scalar *a, const scalar *b, const scalar
     mean[k] = (a[k] + b[k]) / 2;
     goal[k] = (p[k] + q[k]) / 2;
   }
-  turned(palm, mean, palm + 9);
+  rotate(palm, mean, palm + 9);
   for (k = 0; k < 3; ++k) palm[9 + k] = goal[k] - palm[9 + k];
 }
 
-/* Whether to try what is as rarely clear as a bin tells. */
-static int lucky(touch_job *job, const scalar *clear, const scalar *tried, int64_t bin) {
-  scalar best = 0;
+/* Return 1 with a probability proportional to the success rate of a bin: its share of
+ * collision-free trials, relative to the best bin. */
+static int accept_bin(touch_job *job, const scalar *n_free, const scalar *n_trials, int64_t bin) {
+  scalar best = 0, probability;
   int k;
-  for (k = 0; k < BINS; ++k) best = clear[k] > best * tried[k] ? clear[k] / tried[k] : best;
-  best = clear[bin] / tried[bin] / best;
-  return chance(job) < (best > job->least_often ? best : job->least_often);
+  for (k = 0; k < BINS; ++k) {
+    best = n_free[k] > best * n_trials[k] ? n_free[k] / n_trials[k] : best;
+  }
+  probability = n_free[bin] / n_trials[bin] / best;
+  if (probability < job->min_trial_probability) probability = job->min_trial_probability;
+  return random_fraction(job) < probability;
 }
 
 static int64_t bin_of(scalar value) {
@@ -205,226 +221,238 @@ static int64_t bin_of(scalar value) {
   return bin < 0 ? 0 : bin < BINS ? bin : BINS - 1;
 }
 
-/* How far a pad's middle at a tip is off the surface by how it leans there; false where it touches
- * nothing. */
-static int rests(const touch_job *job, const scalar *palm, int64_t finger, const scalar *tip,
-                 const scalar *normal, int64_t sample, const scalar *thumb, scalar *against) {
-  const scalar *outward = job->outward + 3 * sample, *at = job->samples + 3 * sample;
-  const scalar off[3] = {tip[X] - at[X], tip[Y] - at[Y], tip[Z] - at[Z]};
-  scalar faces[3];
-  if (!job->inside[sample] || fabs(dot(off, outward) - job->radii[finger]) >= job->near) return 0;
-  turned(palm, normal, faces);
-  *against = -dot(faces, thumb);
-  return -dot(faces, outward) > job->cos_lean[finger];
+/* Return 1 if a pad touches the surface at a sample within the limits of height and lean.
+ * `opposition` becomes the cosine between its normal and the reversed normal of the thumb. */
+static int pad_touches(const touch_job *job, const scalar *palm, int64_t finger, const scalar *tip,
+                       const scalar *normal, int64_t sample, const scalar *thumb_normal,
+                       scalar *opposition) {
+  const scalar *outward = job->outward + 3 * sample, *point = job->samples + 3 * sample;
+  const scalar offset[3] = {tip[X] - point[X], tip[Y] - point[Y], tip[Z] - point[Z]};
+  scalar pad_normal[3];
+  if (!job->fits_pad[sample]) return 0;
+  if (fabs(dot(offset, outward) - job->radii[finger]) >= job->max_height) return 0;
+  rotate(palm, normal, pad_normal);
+  *opposition = -dot(pad_normal, thumb_normal);
+  return -dot(pad_normal, outward) > job->cos_lean[finger];
 }
 
-/* A posture for a finger that touches if more are wanted, else one that is clear; -1: none. */
-static int64_t posture_for(touch_job *job, const scalar *palm, int64_t share, int64_t finger,
-                           const int64_t *postures, const int *there, const scalar *thumb,
-                           int wanted, int needed, int64_t *used) {
-  const int64_t count = job->postures, turn = below(job, count);
-  uint64_t open[MOST_WORDS];
-  int64_t candidate[MOST_WORDS * 64], idle[MOST_WORDS * 64], n = 0, n_idle = 0, i, k, w;
-  scalar rank[MOST_WORDS * 64];
-  for (w = 0; w < job->words; ++w) open[w] = ~(uint64_t) 0;
+/* Return a posture of a finger that touches the object or, unless `must_touch`, a collision-free
+ * one; -1 if there is none. Sets `touches` to 1 if the finger touches. `is_placed` marks the fingers
+ * with a posture. */
+static int64_t choose_posture(touch_job *job, const scalar *palm, int64_t share, int64_t finger,
+                              const int64_t *postures, const int *is_placed,
+                              const scalar *thumb_normal, int may_touch, int must_touch,
+                              int64_t *touches) {
+  const int64_t count = job->postures, shift = random_index(job, count);
+  uint64_t permitted[MAX_WORDS];
+  int64_t candidate[MAX_WORDS * 64], idle[MAX_WORDS * 64], n = 0, n_idle = 0, i, k, w;
+  scalar score[MAX_WORDS * 64];
+  for (w = 0; w < job->words; ++w) permitted[w] = ~(uint64_t) 0;
   for (k = 0; k < job->n_fingers; ++k) {
-    const uint64_t *row = bits(job, share, k, finger, postures[k]);
-    for (w = 0; there[k] && w < job->words; ++w) open[w] &= row[w];
+    const uint64_t *row = separate_postures(job, share, k, finger, postures[k]);
+    for (w = 0; is_placed[k] && w < job->words; ++w) permitted[w] &= row[w];
   }
   for (k = 0; k < count; ++k) {
-    const int64_t posture = k + turn < count ? k + turn : k + turn - count;
-    scalar tip[3], height, against;
+    const int64_t posture = k + shift < count ? k + shift : k + shift - count;
+    scalar tip[3], height, opposition;
     int64_t cell;
-    if (!(open[posture / 64] >> posture % 64 & 1)) continue;
-    placed(palm, pad(job, job->points, share, finger, posture), tip);
-    cell = cell_of(job->near_low, job->near_count, tip);
-    height = cell < 0 ? INFINITY : job->near_height[cell] - job->radii[finger];
-    if (height > job->clear) idle[n_idle++] = posture;
-    if (!wanted || cell < 0 || fabs(height) > job->near + job->near_low[3]) continue;
-    if (!rests(job, palm, finger, tip, pad(job, job->normals, share, finger, posture),
-               job->near_sample[cell], thumb, &against)) continue;
+    if (!(permitted[posture / 64] >> posture % 64 & 1)) continue;
+    transform(palm, pad(job, job->points, share, finger, posture), tip);
+    cell = cell_of(job->surface_low, job->surface_count, tip);
+    height = cell < 0 ? INFINITY : job->surface_height[cell] - job->radii[finger];
+    if (height > job->idle_clearance) idle[n_idle++] = posture;
+    if (!may_touch || cell < 0 || fabs(height) > job->max_height + job->surface_low[3]) continue;
+    if (!pad_touches(job, palm, finger, tip, pad(job, job->normals, share, finger, posture),
+                     job->surface_sample[cell], thumb_normal, &opposition)) continue;
     candidate[n] = posture;
-    /* Rather one that pushes against the thumb. */
-    rank[n++] = chance(job) + 2 * against;
+    /* Postures that push against the thumb are preferred. */
+    score[n++] = random_fraction(job) + 2 * opposition;
   }
-  for (k = 0; k < n && k < job->tries; ++k) {
+  for (k = 0; k < n && k < job->max_posture_trials; ++k) {
     int64_t best = 0;
-    for (i = 1; i < n; ++i) best = rank[i] > rank[best] ? i : best;
-    if (finger_clear(job, palm, share, finger, candidate[best], 1)) {
-      *used = 1;
+    for (i = 1; i < n; ++i) best = score[i] > score[best] ? i : best;
+    if (finger_is_free(job, palm, share, finger, candidate[best], 1)) {
+      *touches = 1;
       return candidate[best];
     }
-    rank[best] = -INFINITY;
+    score[best] = -INFINITY;
   }
-  for (k = 0; !needed && k < n_idle && k < job->tries; ++k) {
-    if (finger_clear(job, palm, share, finger, idle[k], 0)) return idle[k];
+  for (k = 0; !must_touch && k < n_idle && k < job->max_posture_trials; ++k) {
+    if (finger_is_free(job, palm, share, finger, idle[k], 0)) return idle[k];
   }
   return -1;
 }
 
-/* The other fingers, in any order. */
-static int others_placed(touch_job *job, const scalar *palm, int64_t share, int64_t *postures,
-                         int64_t *used, const scalar *thumb) {
-  int there[MOST_FINGERS];
-  int64_t order[MOST_FINGERS], left = 0, touching = 2, k;
+/* Choose postures of the remaining fingers in random order; return 1 if enough fingers touch. */
+static int place_remaining_fingers(touch_job *job, const scalar *palm, int64_t share,
+                                   int64_t *postures, int64_t *touches,
+                                   const scalar *thumb_normal) {
+  int is_placed[MAX_FINGERS];
+  int64_t order[MAX_FINGERS], n_remaining = 0, n_touching = 2, k;
   for (k = 0; k < job->n_fingers; ++k) {
-    there[k] = (int) used[k];
-    if (!there[k]) order[left++] = k;
+    is_placed[k] = (int) touches[k];
+    if (!is_placed[k]) order[n_remaining++] = k;
   }
-  while (left) {
-    const int64_t place = below(job, left), finger = order[place];
-    order[place] = order[--left];
-    postures[finger] = posture_for(job, palm, share, finger, postures, there, thumb,
-                                   touching < job->fingers, touching + left < job->fingers,
-                                   used + finger);
+  while (n_remaining) {
+    const int64_t index = random_index(job, n_remaining), finger = order[index];
+    order[index] = order[--n_remaining];
+    postures[finger] = choose_posture(job, palm, share, finger, postures, is_placed, thumb_normal,
+                                      n_touching < job->n_touching,
+                                      n_touching + n_remaining < job->n_touching,
+                                      touches + finger);
     if (postures[finger] < 0) return 0;
-    there[finger] = 1;
-    touching += used[finger];
+    is_placed[finger] = 1;
+    n_touching += touches[finger];
   }
-  return touching == job->fingers;
+  return n_touching == job->n_touching;
 }
 
-/* One attempt; whether it came to a grasp, which is at the end of the others then. */
+/* Make one attempt; return 1 if it gave a hand, which is stored behind the previous ones. */
 static int attempt(touch_job *job) {
-  const int64_t *patch = job->patches + 4 * below(job, job->n_patches);
-  const int64_t row = patch[2] + below(job, patch[3]), *cell = job->pairs + 4 * row;
-  const int64_t share = cell[0], one = job->thumb, other = cell[1];
-  const int64_t which[2] = {one, other}, at[2] = {cell[2], cell[3]};
-  scalar *palm = job->palms + 12 * job->found, middle[2][3], inward[2][3], faces[3], thumb[3];
-  int64_t *postures = job->postured + job->n_fingers * job->found;
-  int64_t *used = job->used + job->n_fingers * job->found;
-  int64_t depth = bin_of(job->depths[row]), way, k;
+  const int64_t *patch = job->patches + 4 * random_index(job, job->n_patches);
+  const int64_t row = patch[2] + random_index(job, patch[3]), *cell = job->pairs + 4 * row;
+  const int64_t share = cell[0], thumb = job->thumb, finger = cell[1];
+  const int64_t fingers[2] = {thumb, finger}, pair_postures[2] = {cell[2], cell[3]};
+  scalar *palm = job->palms + 12 * job->n_hands, goals[2][3], inward[2][3];
+  scalar finger_normal[3], thumb_normal[3];
+  int64_t *postures = job->hand_postures + job->n_fingers * job->n_hands;
+  int64_t *touches = job->touches + job->n_fingers * job->n_hands;
+  int64_t depth = bin_of(job->depths[row]), direction, k;
   const scalar *point[2], *normal[2];
-  int side, clear;
-  if (!lucky(job, job->depth_clear, job->depth_tried, depth)) return 0;
+  int side, is_free;
+  if (!accept_bin(job, job->depth_free, job->depth_trials, depth)) return 0;
   ++job->attempts;
   for (side = 0; side < 2; ++side) {
     const scalar *outward = job->outward + 3 * patch[side];
     for (k = 0; k < 3; ++k) {
       inward[side][k] = -outward[k];
-      middle[side][k] = job->samples[3 * patch[side] + k] + job->radii[which[side]] * outward[k];
+      goals[side][k] = job->samples[3 * patch[side] + k] + job->radii[fingers[side]] * outward[k];
     }
-    point[side] = pad(job, job->points, share, which[side], at[side]);
-    normal[side] = pad(job, job->normals, share, which[side], at[side]);
+    point[side] = pad(job, job->points, share, fingers[side], pair_postures[side]);
+    normal[side] = pad(job, job->normals, share, fingers[side], pair_postures[side]);
   }
-  match(job, point[0], point[1], normal[0], normal[1], middle[0], middle[1], inward[0], inward[1], palm);
-  turned(palm, normal[1], faces);
-  turned(palm, normal[0], thumb);
-  if (dot(thumb, inward[0]) <= job->cos_lean[one]) return 0;
-  if (dot(faces, inward[1]) <= job->cos_lean[other]) return 0;
-  /* Where the palm's z points, up or down. */
-  way = bin_of(0.5 + 0.5 * (palm[2] * job->up[X] + palm[5] * job->up[Y] + palm[8] * job->up[Z]));
-  if (!lucky(job, job->way_clear, job->way_tried, way)) return 0;
-  ++job->fit;
-  clear = clear_of_all(job, palm, job->fixed, 0, job->n_fixed, job->n_capsules, 0)
-       && finger_clear(job, palm, share, one, at[0], 1)
-       && finger_clear(job, palm, share, other, at[1], 1);
-  job->depth_tried[depth] += 1;
-  job->depth_clear[depth] += clear;
-  job->way_tried[way] += 1;
-  job->way_clear[way] += clear;
-  if (!clear) return 0;
-  ++job->free;
-  for (k = 0; k < job->n_fingers; ++k) postures[k] = used[k] = 0;
-  used[one] = used[other] = 1;
-  postures[one] = at[0];
-  postures[other] = at[1];
-  job->shared[job->found] = share;
-  return others_placed(job, palm, share, postures, used, thumb);
+  match(job, point[0], point[1], normal[0], normal[1], goals[0], goals[1], inward[0], inward[1], palm);
+  rotate(palm, normal[1], finger_normal);
+  rotate(palm, normal[0], thumb_normal);
+  if (dot(thumb_normal, inward[0]) <= job->cos_lean[thumb]) return 0;
+  if (dot(finger_normal, inward[1]) <= job->cos_lean[finger]) return 0;
+  /* The bin of the palm direction follows from the vertical component of its z axis. */
+  direction = bin_of(0.5 + 0.5 * (palm[2] * job->up[X] + palm[5] * job->up[Y] + palm[8] * job->up[Z]));
+  if (!accept_bin(job, job->direction_free, job->direction_trials, direction)) return 0;
+  ++job->n_matched;
+  is_free = capsules_are_free(job, palm, job->palm_capsules, 0, job->n_palm_capsules,
+                              job->n_capsules, 0)
+         && finger_is_free(job, palm, share, thumb, pair_postures[0], 1)
+         && finger_is_free(job, palm, share, finger, pair_postures[1], 1);
+  job->depth_trials[depth] += 1;
+  job->depth_free[depth] += is_free;
+  job->direction_trials[direction] += 1;
+  job->direction_free[direction] += is_free;
+  if (!is_free) return 0;
+  ++job->n_free;
+  for (k = 0; k < job->n_fingers; ++k) postures[k] = touches[k] = 0;
+  touches[thumb] = touches[finger] = 1;
+  postures[thumb] = pair_postures[0];
+  postures[finger] = pair_postures[1];
+  job->hand_shares[job->n_hands] = share;
+  return place_remaining_fingers(job, palm, share, postures, touches, thumb_normal);
 }
 
 DRIVER(touch, touch_job) {
   const scalar limit = monotonic() + job->slice;
-  while (job->found < job->wanted && job->attempts < job->most) {
-    if (++job->drawn % 1024 == 0 && monotonic() > limit) return SLICE_OVER;
-    job->found += attempt(job);
+  while (job->n_hands < job->n_requested && job->attempts < job->max_attempts) {
+    if (++job->n_draws % 1024 == 0 && monotonic() > limit) return SLICE_OVER;
+    job->n_hands += attempt(job);
   }
   return DONE;
 }
 
-/* Square of the least distance of two segments, each one end and the way to the other (C. Ericson,
- * Real-Time Collision Detection, section 5.1.9). */
-static scalar squared(const scalar *one, const scalar *other) {
-  const scalar *g = one + 3, *h = other + 3;
-  const scalar r[3] = {one[X] - other[X], one[Y] - other[Y], one[Z] - other[Z]};
-  const scalar a = dot(g, g), b = dot(h, h), both = dot(g, h), d = dot(g, r), f = dot(h, r);
-  scalar s, t, off[3];
+/* Return the squared distance between two segments, each a start and a vector to its end
+ * (C. Ericson, Real-Time Collision Detection, section 5.1.9). */
+static scalar squared_distance(const scalar *first, const scalar *second) {
+  const scalar *g = first + 3, *h = second + 3;
+  const scalar r[3] = {first[X] - second[X], first[Y] - second[Y], first[Z] - second[Z]};
+  const scalar a = dot(g, g), b = dot(h, h), c = dot(g, h), d = dot(g, r), f = dot(h, r);
+  scalar s, t, offset[3];
   int k;
-#define WITHIN(x) fmin(fmax(x, 0), 1)
-  t = WITHIN((both * f - b * d) / fmax(a * b - both * both, 1e-30));
-  s = WITHIN((both * t + f) / fmax(b, 1e-30));
-  t = WITHIN((both * s - d) / fmax(a, 1e-30));
-#undef WITHIN
-  for (k = 0; k < 3; ++k) off[k] = r[k] + t * g[k] - s * h[k];
-  return dot(off, off);
+#define CLAMP(x) fmin(fmax(x, 0), 1)
+  t = CLAMP((c * f - b * d) / fmax(a * b - c * c, 1e-30));
+  s = CLAMP((c * t + f) / fmax(b, 1e-30));
+  t = CLAMP((c * s - d) / fmax(a, 1e-30));
+#undef CLAMP
+  for (k = 0; k < 3; ++k) offset[k] = r[k] + t * g[k] - s * h[k];
+  return dot(offset, offset);
 }
 
-/* Clears the bits of postures of two fingers that meet; `attempts` goes on through the postures. */
+/* Clear the bits of pairs of postures that collide; `attempts` counts the postures of the first
+ * finger. */
 DRIVER(apart, touch_job) {
   const scalar limit = monotonic() + job->slice;
   for (; job->attempts < job->shares * job->postures; ++job->attempts) {
     const int64_t share = job->attempts / job->postures, i = job->attempts % job->postures;
-    const scalar *here = job->capsules + 6 * job->n_capsules * job->attempts;
+    const scalar *first = job->capsules + 6 * job->n_capsules * job->attempts;
     int64_t j, k;
     if (monotonic() > limit) return SLICE_OVER;
     for (j = 0; j < job->postures; ++j) {
-      const scalar *there = job->capsules + 6 * job->n_capsules * (share * job->postures + j);
+      const scalar *second = job->capsules + 6 * job->n_capsules * (share * job->postures + j);
       for (k = 0; k < job->n_crossing; ++k) {
         const int64_t *row = job->crossing + 4 * k;
-        const scalar *one = here + 6 * row[1], *other = there + 6 * row[3], near = job->reach[k];
-        uint64_t *theirs = bits(job, share, row[0], row[2], i) + j / 64;
-        const scalar far = near + (job->lengths[row[1]] + job->lengths[row[3]]) / 2;
-        const scalar r[3] = {one[X] - other[X] + (one[3] - other[3]) / 2,
-                             one[Y] - other[Y] + (one[4] - other[4]) / 2,
-                             one[Z] - other[Z] + (one[5] - other[5]) / 2};
-        if (!(*theirs >> j % 64 & 1) || far <= 0 || dot(r, r) >= far * far) continue;
-        if (near <= 0 || squared(one, other) >= near * near) continue;
-        *theirs &= ~((uint64_t) 1 << j % 64);
-        bits(job, share, row[2], row[0], j)[i / 64] &= ~((uint64_t) 1 << i % 64);
+        const scalar *a = first + 6 * row[1], *b = second + 6 * row[3];
+        const scalar min_distance = job->min_distances[k];
+        uint64_t *word = separate_postures(job, share, row[0], row[2], i) + j / 64;
+        /* Segments whose bounding balls are farther apart do not collide. */
+        const scalar bound = min_distance + (job->lengths[row[1]] + job->lengths[row[3]]) / 2;
+        const scalar r[3] = {a[X] - b[X] + (a[3] - b[3]) / 2,
+                             a[Y] - b[Y] + (a[4] - b[4]) / 2,
+                             a[Z] - b[Z] + (a[5] - b[5]) / 2};
+        if (!(*word >> j % 64 & 1) || bound <= 0 || dot(r, r) >= bound * bound) continue;
+        if (min_distance <= 0 || squared_distance(a, b) >= min_distance * min_distance) continue;
+        *word &= ~((uint64_t) 1 << j % 64);
+        separate_postures(job, share, row[2], row[0], j)[i / 64] &= ~((uint64_t) 1 << i % 64);
       }
     }
   }
   return DONE;
 }
 
-/* Loads: linear programs max s, W x + s d = 0, sum x + slack = 1, all at least 0, by the predictor and
- * corrector of S. Mehrotra (1992), SIDE of them side by side. They end in the middle of what is
- * optimal: where several edges of a cone would do, these share. */
-enum { ROWS = 7, SIDE = 4 };
+/* Loads: linear programs max s subject to W x + s d = 0, sum x + slack = 1, x, s, slack >= 0, by the
+ * predictor-corrector method of S. Mehrotra (1992), LP_LANES programs at once. Interior-point iterates
+ * end at the centre of the optimal face: equivalent edges of a cone share the force. */
+enum { ROWS = 7, LP_LANES = 4 };
 
-/* A number of each, and for which of them something holds. */
-typedef scalar few __attribute__((vector_size(SIDE * sizeof(scalar)), aligned(16)));
-typedef int64_t few_of __attribute__((vector_size(SIDE * sizeof(scalar)), aligned(16)));
+/* Values and masks by lane. */
+typedef scalar lanes __attribute__((vector_size(LP_LANES * sizeof(scalar)), aligned(16)));
+typedef int64_t lane_mask __attribute__((vector_size(LP_LANES * sizeof(scalar)), aligned(16)));
 
-#define SMALLEST 1e-14 /* of variables and dual slacks */
+#define MIN_VARIABLE 1e-14 /* minimum of variables and dual slacks */
 
-/* A share more of the normal matrix's diagonal, for rows that depend on each other, as of contacts on a
- * line; each step is solved so often, for what that leaves. */
-#define MORE 1e-14
-#define PASSES 2
+/* Relative regularisation of the diagonal of the normal matrix, for linearly dependent rows such as
+ * those of contacts on a line, and the number of refinements that reduce its effect. */
+#define REGULARISATION 1e-14
+#define REFINEMENTS 2
 
-/* A column of the matrix, its variable and dual slack with their inverses, and the step of both. */
+/* Column of the matrix, with its variable x, dual slack z, their inverses, dual residual and steps. */
 typedef struct {
-  few at[ROWS], x, z, over_x, over_z, dual, dx, dz;
+  lanes entries[ROWS], x, z, inverse_x, inverse_z, dual, dx, dz;
 } column;
 
 typedef struct {
-  const scalar *wrenches;      /* (count / each, 6, edges) W */
+  const scalar *wrenches;      /* (count / n_directions, 6, edges) W */
   const scalar *directions;    /* (count, 6) d */
-  scalar *solved;              /* (count, edges + 2) x, s and slack */
+  scalar *solutions;           /* (count, edges + 2) x, s and slack */
   scalar *work;                /* (edges + 2) columns */
-  scalar enough;               /* a mean of x z that is followed by the last step */
-  int64_t edges, each, steps, count, next;
+  scalar gap;                  /* mean of x z below which the program ends */
+  int64_t edges, n_directions, max_steps, count, next;
   scalar slice;
 } load_job;
 
-static few most_of(few a, few b) {
-  const few_of first = a > b;
-  return (few) ((first & (few_of) a) | (~first & (few_of) b));
+static lanes lane_max(lanes a, lanes b) {
+  const lane_mask is_greater = a > b;
+  return (lanes) ((is_greater & (lane_mask) a) | (~is_greater & (lane_mask) b));
 }
 
-/* Divides by the matrix of a factor, in place. */
-static void divided(few factor[ROWS][ROWS], few *y) {
+/* Solve with the Cholesky factor of a matrix, in place. */
+static void solve_factored(lanes factor[ROWS][ROWS], lanes *y) {
   int i, k;
   for (i = 0; i < ROWS; ++i) {
     for (k = 0; k < i; ++k) y[i] -= factor[i][k] * y[k];
@@ -436,71 +464,73 @@ static void divided(few factor[ROWS][ROWS], few *y) {
   }
 }
 
-static few along(const column *c, const few *y) {
-  few sum = c->at[0] * y[0];
+/* Return the scalar product of a column with y. */
+static lanes column_dot(const column *c, const lanes *y) {
+  lanes sum = c->entries[0] * y[0];
   int i;
-  for (i = 1; i < ROWS; ++i) sum += c->at[i] * y[i];
+  for (i = 1; i < ROWS; ++i) sum += c->entries[i] * y[i];
   return sum;
 }
 
-/* Newton's step to where x z is `goal` less dx dz of the step before. */
-static void newton(column *all, int64_t n, few factor[ROWS][ROWS], const few *off, few goal, few *y) {
-  few rest[ROWS];
+/* Compute the Newton step towards x z = `goal` - dx dz, with dx and dz of the previous step. */
+static void newton_step(column *columns, int64_t n, lanes factor[ROWS][ROWS], const lanes *primal,
+                        lanes goal, lanes *y) {
+  lanes residual[ROWS];
   int64_t j;
   int i, pass;
   for (j = 0; j < n; ++j) {
-    column *c = all + j;
+    column *c = columns + j;
     c->dz = goal - c->dx * c->dz;
-    c->dx = c->dual + c->z - c->dz * c->over_x;
+    c->dx = c->dual + c->z - c->dz * c->inverse_x;
   }
-  memset(y, 0, ROWS * sizeof(few));
-  for (pass = 0; pass < PASSES; ++pass) {
-    for (i = 0; i < ROWS; ++i) rest[i] = off[i];
+  memset(y, 0, ROWS * sizeof(lanes));
+  for (pass = 0; pass < REFINEMENTS; ++pass) {
+    for (i = 0; i < ROWS; ++i) residual[i] = primal[i];
     for (j = 0; j < n; ++j) {
-      const column *c = all + j;
-      const few part = c->x * c->over_z * (c->dx - along(c, y));
-      for (i = 0; i < ROWS; ++i) rest[i] += c->at[i] * part;
+      const column *c = columns + j;
+      const lanes term = c->x * c->inverse_z * (c->dx - column_dot(c, y));
+      for (i = 0; i < ROWS; ++i) residual[i] += c->entries[i] * term;
     }
-    divided(factor, rest);
-    for (i = 0; i < ROWS; ++i) y[i] += rest[i];
+    solve_factored(factor, residual);
+    for (i = 0; i < ROWS; ++i) y[i] += residual[i];
   }
   for (j = 0; j < n; ++j) {
-    column *c = all + j;
-    c->dx = c->x * c->over_z * (along(c, y) - c->dx);
-    c->dz = (c->dz - c->z * c->dx) * c->over_x - c->z;
+    column *c = columns + j;
+    c->dx = c->x * c->inverse_z * (column_dot(c, y) - c->dx);
+    c->dz = (c->dz - c->z * c->dx) * c->inverse_x - c->z;
   }
 }
 
-/* How far to go, at most once, so that all x and all z stay positive. */
-static void longest(const column *all, int64_t n, few *x, few *z) {
+/* Compute the maximum step lengths, at most 1, at which all x and all z stay positive. */
+static void max_step_lengths(const column *columns, int64_t n, lanes *x, lanes *z) {
   int64_t j;
-  *x = *z = (few) {0} + 1;
+  *x = *z = (lanes) {0} + 1;
   for (j = 0; j < n; ++j) {
-    *x = most_of(*x, -all[j].dx * all[j].over_x);
-    *z = most_of(*z, -all[j].dz * all[j].over_z);
+    *x = lane_max(*x, -columns[j].dx * columns[j].inverse_x);
+    *z = lane_max(*z, -columns[j].dz * columns[j].inverse_z);
   }
   *x = 1 / *x;
   *z = 1 / *z;
 }
 
-/* Factor of A diag(x / z) A', whose diagonal is inverted. */
-static void factorised(const column *all, int64_t n, few a[ROWS][ROWS]) {
+/* Compute the Cholesky factor of A diag(x / z) A', with an inverted diagonal. */
+static void factorise(const column *columns, int64_t n, lanes a[ROWS][ROWS]) {
   int64_t j;
   int i, k, l;
-  memset(a, 0, ROWS * ROWS * sizeof(few));
+  memset(a, 0, ROWS * ROWS * sizeof(lanes));
   for (j = 0; j < n; ++j) {
-    const few ratio = all[j].x * all[j].over_z;
+    const lanes ratio = columns[j].x * columns[j].inverse_z;
     for (i = 0; i < ROWS; ++i) {
-      const few part = ratio * all[j].at[i];
-      for (k = 0; k <= i; ++k) a[i][k] += part * all[j].at[k];
+      const lanes scaled = ratio * columns[j].entries[i];
+      for (k = 0; k <= i; ++k) a[i][k] += scaled * columns[j].entries[k];
     }
   }
   for (k = 0; k < ROWS; ++k) {
-    const few more = MORE * a[k][k] + 1e-300;
-    a[k][k] += more;
+    const lanes shift = REGULARISATION * a[k][k] + 1e-300;
+    a[k][k] += shift;
     for (l = 0; l < k; ++l) a[k][k] -= a[k][l] * a[k][l];
-    a[k][k] = most_of(a[k][k], more);
-    for (i = 0; i < SIDE; ++i) a[k][k][i] = 1 / sqrt(a[k][k][i]);
+    a[k][k] = lane_max(a[k][k], shift);
+    for (i = 0; i < LP_LANES; ++i) a[k][k][i] = 1 / sqrt(a[k][k][i]);
     for (i = k + 1; i < ROWS; ++i) {
       for (l = 0; l < k; ++l) a[i][k] -= a[i][l] * a[k][l];
       a[i][k] *= a[k][k];
@@ -508,37 +538,39 @@ static void factorised(const column *all, int64_t n, few a[ROWS][ROWS]) {
   }
 }
 
-/* One iteration; returns the mean of x z before. */
-static few load_step(column *all, int64_t n, few *y) {
-  const few nothing = {0};
-  few factor[ROWS][ROWS], off[ROWS], dy[ROWS], gap = nothing, after = nothing, x, z;
+/* Make one iteration; return the mean of x z before it. */
+static lanes load_step(column *columns, int64_t n, lanes *y) {
+  const lanes zero = {0};
+  lanes factor[ROWS][ROWS], primal[ROWS], dy[ROWS], gap = zero, affine_gap = zero, x, z;
   int64_t j;
   int i;
-  memset(off, 0, sizeof off);
-  off[ROWS - 1] += 1;
+  memset(primal, 0, sizeof primal);
+  primal[ROWS - 1] += 1;
   for (j = 0; j < n; ++j) {
-    column *c = all + j;
-    c->over_x = 1 / c->x;
-    c->over_z = 1 / c->z;
-    c->dx = c->dz = nothing;
+    column *c = columns + j;
+    c->inverse_x = 1 / c->x;
+    c->inverse_z = 1 / c->z;
+    c->dx = c->dz = zero;
     c->dual = -c->z - (j == n - 2);
     for (i = 0; i < ROWS; ++i) {
-      off[i] -= c->at[i] * c->x;
-      c->dual -= c->at[i] * y[i];
+      primal[i] -= c->entries[i] * c->x;
+      c->dual -= c->entries[i] * y[i];
     }
     gap += c->x * c->z;
   }
-  factorised(all, n, factor);
-  newton(all, n, factor, off, nothing, dy);
-  longest(all, n, &x, &z);
-  for (j = 0; j < n; ++j) after += (all[j].x + x * all[j].dx) * (all[j].z + z * all[j].dz);
-  gap /= (scalar) n;
-  after /= gap * (scalar) n;
-  newton(all, n, factor, off, after * after * after * gap, dy);
-  longest(all, n, &x, &z);
+  factorise(columns, n, factor);
+  newton_step(columns, n, factor, primal, zero, dy);
+  max_step_lengths(columns, n, &x, &z);
   for (j = 0; j < n; ++j) {
-    all[j].x = most_of(all[j].x + 0.99 * x * all[j].dx, nothing + SMALLEST);
-    all[j].z = most_of(all[j].z + 0.99 * z * all[j].dz, nothing + SMALLEST);
+    affine_gap += (columns[j].x + x * columns[j].dx) * (columns[j].z + z * columns[j].dz);
+  }
+  gap /= (scalar) n;
+  affine_gap /= gap * (scalar) n;
+  newton_step(columns, n, factor, primal, affine_gap * affine_gap * affine_gap * gap, dy);
+  max_step_lengths(columns, n, &x, &z);
+  for (j = 0; j < n; ++j) {
+    columns[j].x = lane_max(columns[j].x + 0.99 * x * columns[j].dx, zero + MIN_VARIABLE);
+    columns[j].z = lane_max(columns[j].z + 0.99 * z * columns[j].dz, zero + MIN_VARIABLE);
   }
   for (i = 0; i < ROWS; ++i) y[i] += 0.99 * z * dy[i];
   return gap;
@@ -547,33 +579,33 @@ static few load_step(column *all, int64_t n, few *y) {
 DRIVER(loads, load_job) {
   const scalar limit = monotonic() + job->slice;
   const int64_t n = job->edges + 2;
-  column *all = (column *) job->work;
-  for (; job->next < job->count; job->next += SIDE) {
-    const int64_t here = job->count - job->next < SIDE ? job->count - job->next : SIDE;
-    int64_t step, j, l, left = here;
-    int done[SIDE] = {0}, i;
-    few y[ROWS];
+  column *columns = (column *) job->work;
+  for (; job->next < job->count; job->next += LP_LANES) {
+    const int64_t n_programs = job->count - job->next < LP_LANES ? job->count - job->next : LP_LANES;
+    int64_t step, j, l, n_running = n_programs;
+    int is_done[LP_LANES] = {0}, i;
+    lanes y[ROWS];
     if (monotonic() > limit) return SLICE_OVER;
     memset(y, 0, sizeof y);
-    memset(all, 0, (size_t) n * sizeof(column));
-    for (l = 0; l < SIDE; ++l) { /* where there are less, the last several times */
-      const int64_t number = job->next + (l < here ? l : here - 1);
-      const scalar *wrench = job->wrenches + number / job->each * 6 * job->edges;
+    memset(columns, 0, (size_t) n * sizeof(column));
+    for (l = 0; l < LP_LANES; ++l) { /* unused lanes repeat the last program */
+      const int64_t number = job->next + (l < n_programs ? l : n_programs - 1);
+      const scalar *wrench = job->wrenches + number / job->n_directions * 6 * job->edges;
       for (j = 0; j < n; ++j) {
-        for (i = 0; i < 6 && j < job->edges; ++i) all[j].at[i][l] = wrench[i * job->edges + j];
-        all[j].at[6][l] = j != job->edges;
-        all[j].x[l] = 1 / (scalar) n;
-        all[j].z[l] = 1;
+        for (i = 0; i < 6 && j < job->edges; ++i) columns[j].entries[i][l] = wrench[i * job->edges + j];
+        columns[j].entries[6][l] = j != job->edges;
+        columns[j].x[l] = 1 / (scalar) n;
+        columns[j].z[l] = 1;
       }
-      for (i = 0; i < 6; ++i) all[job->edges].at[i][l] = job->directions[6 * number + i];
+      for (i = 0; i < 6; ++i) columns[job->edges].entries[i][l] = job->directions[6 * number + i];
     }
-    for (step = 1; step <= job->steps && left; ++step) {
-      const few gap = load_step(all, n, y);
-      for (l = 0; l < here; ++l) {
-        if (done[l] || (gap[l] >= job->enough && step < job->steps)) continue;
-        for (j = 0; j < n; ++j) job->solved[n * (job->next + l) + j] = all[j].x[l];
-        done[l] = 1;
-        --left;
+    for (step = 1; step <= job->max_steps && n_running; ++step) {
+      const lanes gap = load_step(columns, n, y);
+      for (l = 0; l < n_programs; ++l) {
+        if (is_done[l] || (gap[l] >= job->gap && step < job->max_steps)) continue;
+        for (j = 0; j < n; ++j) job->solutions[n * (job->next + l) + j] = columns[j].x[l];
+        is_done[l] = 1;
+        --n_running;
       }
     }
   }

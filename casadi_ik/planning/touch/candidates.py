@@ -152,21 +152,21 @@ class Generator:
         f = len(table.radii)
         palms, shared = np.empty((count, 12)), np.empty(count, dtype=np.int64)
         postures, touches = np.empty((2, count, f), dtype=np.int64)
-        job.palms, job.shared = palms.ctypes.data, shared.ctypes.data
-        job.postured, job.used = postures.ctypes.data, touches.ctypes.data
+        job.palms, job.hand_shares = palms.ctypes.data, shared.ctypes.data
+        job.hand_postures, job.touches = postures.ctypes.data, touches.ctypes.data
         job.patches, job.n_patches = self._pairs.ctypes.data, len(self._pairs)
-        job.wanted, job.found = count, 0
-        job.most = job.attempts + self.parameters.max_attempts_per_batch
+        job.n_requested, job.n_hands = count, 0
+        job.max_attempts = job.attempts + self.parameters.max_attempts_per_batch
         run_cancellable("touch", self._entry, job)
-        n = job.found
+        n = job.n_hands
         hand = table.q[shared[:n], postures[:n, table.thumb]].copy()
         for finger in range(f):
             posture = table.q[shared[:n], postures[:n, finger]]
             table.copy_finger(hand, np.arange(n), posture, finger)
         self.counts |= {
             "attempts": job.attempts,
-            "two fingertips matched": job.fit,
-            "matched fingers collision-free": job.free,
+            "two fingertips matched": job.n_matched,
+            "matched fingers collision-free": job.n_free,
         }
         self.count(f"{self.fingers} fingertips touch, hand collision-free", n)
         palm = rigid_transforms(palms[:n, :9].reshape(-1, 3, 3), palms[:n, 9:])
@@ -181,17 +181,17 @@ class Generator:
         arrays: dict[str, Any] = {
             "points": table.points,
             "normals": table.normals,
-            "off_object": check.standoffs(of_object=True),
-            "off_scene": check.standoffs(of_object=False),
+            "object_standoffs": check.standoffs(of_object=True),
+            "scene_standoffs": check.standoffs(of_object=False),
             "radii": table.radii,
             "cos_lean": np.cos(parameters.max_initial_lean + table.roll),
             "pairs": table.pairs.astype(np.int64),
             "depths": table.depths / parameters.max_pinch_depth,
             "samples": surface.points,
             "outward": surface.normals,
-            "inside": surface.fits_pad.astype(np.int64),
-            "near_height": surface.grid.value,
-            "near_sample": surface.grid.sample,
+            "fits_pad": surface.fits_pad.astype(np.int64),
+            "surface_height": surface.grid.value,
+            "surface_sample": surface.grid.sample,
             "object_value": object_grid.value,
             "scene_value": scene_grid.value,
         }
@@ -200,21 +200,21 @@ class Generator:
             **shapes.job,
             **{name: array.ctypes.data for name, array in arrays.items()},
             thumb=table.thumb,
-            near=parameters.max_initial_height,
-            clear=parameters.idle_clearance,
-            least_often=parameters.min_trial_probability,
-            fingers=self.fingers,
-            tries=parameters.max_posture_trials,
+            max_height=parameters.max_initial_height,
+            idle_clearance=parameters.idle_clearance,
+            min_trial_probability=parameters.min_trial_probability,
+            n_touching=self.fingers,
+            max_posture_trials=parameters.max_posture_trials,
             seed=seed,
         )
-        grids = {"near": surface.grid, "object": object_grid, "scene": scene_grid}
+        grids = {"surface": surface.grid, "object": object_grid, "scene": scene_grid}
         for name, grid in grids.items():
             getattr(job, f"{name}_low")[:] = grid.low.tolist()
             getattr(job, f"{name}_count")[:] = grid.counts.tolist()
         job.up[:] = check.pose[2, :3].tolist()
-        for name in ("depth", "way"):
-            getattr(job, f"{name}_clear")[:] = [1.0] * BINS
-            getattr(job, f"{name}_tried")[:] = [2.0] * BINS
+        for name in ("depth", "direction"):
+            getattr(job, f"{name}_free")[:] = [1.0] * BINS
+            getattr(job, f"{name}_trials")[:] = [2.0] * BINS
         return job, (arrays, shapes)
 
 
@@ -287,7 +287,7 @@ def refine_hands(
     arrays: dict[str, Any] = {
         "palms": palms,
         "q": q,
-        "used": hands.touches.astype(np.int64),
+        "touches": hands.touches.astype(np.int64),
         "motors": motors.astype(np.int64),
         "lower": robot.lower[motors],
         "upper": robot.upper[motors],
@@ -302,8 +302,8 @@ def refine_hands(
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     job = SnapJob(
         **{name: array.ctypes.data for name, array in arrays.items()},
-        slide=parameters.sliding_weight,
-        turn=parameters.lean_length,
+        sliding_weight=parameters.sliding_weight,
+        lean_length=parameters.lean_length,
         steps=parameters.refinement_steps,
         count=len(q),
         slice=SLICE,

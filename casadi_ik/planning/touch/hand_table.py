@@ -364,17 +364,22 @@ class HandShapes:
         """Fields of a `TouchJob` that describe the hand."""
         s, n, c, _ = self.capsules.shape
         arrays = {
-            name: getattr(self, name)
-            for name in ("capsules", "fixed", "lengths", "first", "pads", "crossing")
+            "capsules": self.capsules,
+            "palm_capsules": self.fixed,
+            "lengths": self.lengths,
+            "first": self.first,
+            "may_touch": self.pads,
+            "separate": self.separate,
+            "crossing": self.crossing,
+            "min_distances": self.min_distances,
         }
-        arrays |= {"apart": self.separate, "reach": self.min_distances}
         return {name: array.ctypes.data for name, array in arrays.items()} | {
             "shares": s,
             "postures": n,
             "words": self.separate.shape[-1],
             "n_fingers": self.separate.shape[1],
             "n_capsules": c,
-            "n_fixed": len(self.fixed),
+            "n_palm_capsules": len(self.fixed),
             "n_crossing": len(self.crossing),
             "slice": SLICE,
         }

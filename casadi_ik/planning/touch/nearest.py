@@ -87,8 +87,8 @@ class TriangleTree:
         count = int(np.prod(shape))
         results = {
             "feet": np.empty((*shape, 3)),
-            "ways": np.empty((*shape, 3)),
-            "spread": np.empty(shape),
+            "mean_normals": np.empty((*shape, 3)),
+            "min_cosines": np.empty(shape),
         }
         arrays: dict[str, Any] = {
             **self._arrays,
@@ -104,9 +104,9 @@ class TriangleTree:
             slice=SLICE,
         )
         run_cancellable("nearest", touch_library()["casadi_ik_nearest"], job)
-        cosine = results["spread"]
+        cosine = results["min_cosines"]
         normal_spread = np.where(cosine > 1 - 1e-12, 0.0, np.arccos(np.clip(cosine, -1, 1)))
-        return NearestPoints(results["feet"], results["ways"], normal_spread)
+        return NearestPoints(results["feet"], results["mean_normals"], normal_spread)
 
 
 def _morton_order(points: Array) -> NDArray[np.intp]:

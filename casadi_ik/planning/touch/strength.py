@@ -298,15 +298,15 @@ def _solve_programs(wrenches: Array, directions: Array) -> Array:
     arrays = {
         "wrenches": np.ascontiguousarray(wrenches),
         "directions": np.ascontiguousarray(np.broadcast_to(directions, (k, d, 6))),
-        "solved": solutions,
+        "solutions": solutions,
         "work": np.empty((g + 2) * COLUMN_SIZE),
     }
     job = LoadJob(
         **{name: array.ctypes.data for name, array in arrays.items()},
-        enough=LP_GAP,
+        gap=LP_GAP,
         edges=g,
-        each=d,
-        steps=MAX_LP_ITERATIONS,
+        n_directions=d,
+        max_steps=MAX_LP_ITERATIONS,
         count=k * d,
         slice=SLICE,
     )
