@@ -16,32 +16,22 @@ module.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
 from math import sqrt
 from typing import NamedTuple, TypeAlias
 
 import casadi as ca
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.compile.layout import Field
-from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.forward import ActuatedKinematics, Kinematics
 from casadi_ik.kinematics.se3 import angle_between, log_so3, normal_error, perpendicular, skew
 from casadi_ik.kinematics.smooth import Expr, safe_norm
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.grasp import (
-    EXTRA_VECTORS,
-    invalid_mask,
-    invalid_reason,
-    orthogonal_tangents,
-    unit_vectors,
-)
-from casadi_ik.model.targets import DIRECTIONS_KEY, TargetBatch
+from casadi_ik.model.targets import TargetBatch
 
 LENGTH = 0.1
 """Length by which position errors are divided, for equal weight with unit vectors [m]."""
@@ -74,8 +64,8 @@ class Condition:
         error: ``(tip, goal) -> (3, 1)`` displacement from the tip to the goal [m], or rotation
             vector [rad].
         directions: ``(tip, goal) -> (m, 3)`` constrained directions; None if all three are
-            constrained, in which case the error of a position is minus its residual. Multiplied
-            by the geometric Jacobian they give the Jacobian of the error at the goal.
+            constrained, in which case the error of a position is minus its residual. Their product
+            with the geometric Jacobian is the Jacobian of the error at the goal.
         measure: ``(tip, goal) ->`` distance [m] or angle [rad].
     """
 
@@ -91,7 +81,7 @@ class Condition:
 
 
 def _goal_to_tip(tip: Vectors, goal: Vectors) -> Expr:
-    """Return the vector from the point of the goal to that of the tip."""
+    """Return the vector from the point of the goal to the point of the tip."""
     return tip["point"] - goal["point"]
 
 
@@ -119,7 +109,7 @@ def _tip_to_line(tip: Vectors, goal: Vectors) -> Expr:
 
 
 def _goal_to_pad(tip: Vectors, goal: Vectors) -> Expr:
-    """Return the vector from the goal to the point of the pad ball with the normal of the goal."""
+    """Return the vector from the goal to the point of the pad ball whose normal is the goal's."""
     radius = ca.dot(tip["pad"], tip["normal"])
     return _goal_to_tip(tip, goal) - tip["pad"] + radius * goal["ball"]
 
@@ -411,7 +401,7 @@ class ContactRows:
 
 
 def _weighted_rows(rows: Sequence[Sequence[Expr]], weights: Expr) -> Expr:
-    """(place, facing) rows of all fingers, positions divided by `LENGTH`."""
+    """Return the rows of all fingers: positions divided by `LENGTH`, then orientations."""
     positions = [position / LENGTH * weights[i, 0] for i, (position, _) in enumerate(rows)]
     orientations = [orientation * weights[i, 1] for i, (_, orientation) in enumerate(rows)]
     return ca.vertcat(*positions, *orientations)
@@ -420,7 +410,7 @@ def _weighted_rows(rows: Sequence[Sequence[Expr]], weights: Expr) -> Expr:
 def within_tolerance(
     distances: Expr, angles: Expr, position_tolerance: Expr, angle_tolerance: Expr
 ) -> Expr:
-    """Return whether every contact is within tolerance.
+    """Return 1 if the errors of all contacts are within tolerance.
 
     Args:
         distances: (f, 1) [m], zero where free.
@@ -446,7 +436,7 @@ def tip_vectors(kinematics: Kinematics, finger: str) -> Vectors:
 
 
 def tip_jacobians(body: ActuatedKinematics, finger: str, actuators: Sequence[int]) -> Rates:
-    """Return the Jacobians (3, k) of `tip_vectors` by actuators."""
+    """Return the Jacobians (3, k) of `tip_vectors` with respect to actuators."""
     linear, angular = body.contact_jacobian(finger, actuators)
     axis_jacobians = {
         name: -skew(axis) @ angular
@@ -459,124 +449,6 @@ def tip_jacobians(body: ActuatedKinematics, finger: str, actuators: Sequence[int
 def fixed_goal_rates(goals: Sequence[Vectors], k: int) -> list[Rates]:
     """Return the zero Jacobians of fixed targets."""
     return [dict.fromkeys(goal, ca.SX(3, k)) for goal in goals]
-
-
-EXTRA_ARRAY_NAMES = tuple(f"{name}s" for name in EXTRA_VECTORS)
-"""Names of the arrays of extra target vectors."""
-
-
-def check_extra_vectors(
-    extra_vectors: Mapping[str, ArrayLike | None], points: Array, normals: Array, first_row: int = 0
-) -> dict[str, Array]:
-    """Check the extra vectors of a batch.
-
-    Args:
-        extra_vectors: (k, f, 3) by name; NaN where free, None if absent.
-        points: (k, f, 3) checked [m].
-        normals: (k, f, 3) checked, unit.
-        first_row: Index of the first row, for messages.
-
-    Returns:
-        Unit vectors (k, f, 3) by name, without those that are free everywhere.
-
-    Raises:
-        UnknownNameError: The name of an array is unknown.
-        RowError: A vector is partly NaN, infinite, zero or inconsistent with the others; the
-            message names row and finger.
-        InputError: An array has a wrong shape or is not numeric.
-    """
-    arrays: dict[str, Array] = {}
-    for name, value in extra_vectors.items():
-        if name not in EXTRA_ARRAY_NAMES:
-            expected = ", ".join((*EXTRA_ARRAY_NAMES, DIRECTIONS_KEY))
-            raise UnknownNameError(f"{name!r} does not exist; expected one of {expected}")
-        if value is None:
-            continue
-        try:
-            array = np.array(value, dtype=float)
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{name}: expected an array of numbers") from error
-        if array.shape != points.shape:
-            raise InputError(f"{name}: found shape {array.shape}, expected {points.shape}")
-        if not np.isnan(array).all():
-            arrays[name] = array
-    if not arrays:
-        return arrays
-    is_invalid, units = np.zeros(points.shape[:2], dtype=bool), dict[str, Array]()
-    for name, array in arrays.items():
-        is_given = ~np.isnan(array).all(axis=2)
-        with np.errstate(invalid="ignore"):
-            units[name], zero = unit_vectors(array)
-        is_invalid |= is_given & (zero | ~np.isfinite(array).all(axis=2))
-    vectors = {name[:-1]: array for name, array in units.items()}
-    is_invalid |= invalid_mask({"point": points, "normal": normals, **vectors})
-    for row, finger in np.argwhere(is_invalid)[:1].tolist():
-        all_arrays = {"points": points, "normals": normals, **arrays}
-        problem = _describe_problem(
-            {name: array[row, finger] for name, array in all_arrays.items()}
-        )
-        raise RowError(f"row {first_row + row}, finger {finger}: {problem}", first_row + row)
-    if "tangents" in units:
-        units["tangents"] = orthogonal_tangents(units["tangents"], normals)
-    return units
-
-
-def _describe_problem(vectors: Mapping[str, Array]) -> str:
-    """Return the problem of an invalid contact."""
-    units: dict[str, Array] = {}
-    for name, vector in vectors.items():
-        if np.isnan(vector).all():
-            continue
-        if not np.isfinite(vector).all():
-            return f"{name[:-1]}: found {vector.tolist()}, expected finite numbers, or all NaN"
-        unit, zero = unit_vectors(vector)
-        if name in EXTRA_ARRAY_NAMES and zero:
-            return f"{name[:-1]}: found {vector.tolist()}, expected a direction, not zero"
-        units[name[:-1]] = unit if name in EXTRA_ARRAY_NAMES else vector
-    return invalid_reason(units) or "malformed"
-
-
-def group_by_kinds(
-    targets: TargetBatch,
-) -> Iterator[tuple[Kinds, slice | NDArray[np.intp], TargetBatch]]:
-    """Group targets by the kinds of their contacts, one group per kernel.
-
-    The kinds of a target do not depend on the batch. If one finger has a tangent, all fingers get
-    a free tangent, and if one has a ball, fingers without a point get one: compiling a kernel for
-    every combination would gain almost nothing.
-
-    Yields:
-        Kinds, rows (a full slice if there is one group) and the targets in these rows.
-    """
-    f = targets.points.shape[1]
-    if not targets.extra_vectors:
-        yield point_normal_kinds(f), slice(None), targets
-        return
-    names = list(targets.extra_vectors)
-    has_vector = np.stack(
-        [~np.isnan(targets.extra_vectors[name][..., 0]) for name in names], axis=2
-    )
-    if "tangents" in names:
-        has_tangent = has_vector[..., names.index("tangents")]
-        has_tangent[:] = has_tangent.any(axis=1, keepdims=True)
-    if "balls" in names:
-        has_ball = has_vector[..., names.index("balls")]
-        has_ball |= has_ball.any(axis=1, keepdims=True) & np.isnan(targets.points[..., 0])
-    flags = has_vector.reshape(len(has_vector), -1)
-    _, first_rows, group = np.unique(
-        flags @ (1 << np.arange(flags.shape[1])), return_index=True, return_inverse=True
-    )
-    for i, finger_flags in enumerate(has_vector[first_rows].tolist()):
-        kinds = tuple(
-            kind_from_vectors(name[:-1] for name, flag in zip(names, row, strict=True) if flag)
-            for row in finger_flags
-        )
-        if len(first_rows) == 1:
-            yield kinds, slice(None), targets
-            return
-        rows = np.flatnonzero(group == i)
-        row_numbers = np.array([targets.row_number(row) for row in rows.tolist()])
-        yield kinds, rows, replace(targets.rows(rows), row_numbers=row_numbers)
 
 
 def target_fields(robot: RobotDescription) -> tuple[Field, ...]:
@@ -609,7 +481,7 @@ class Target:
 
     @property
     def vectors(self) -> Vectors:
-        """Point and normal as the conditions of a contact take them."""
+        """Point and normal by name, for the conditions of a contact."""
         return {"point": self.point, "normal": self.normal}
 
 

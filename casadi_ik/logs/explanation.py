@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
+from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import Event
 from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log

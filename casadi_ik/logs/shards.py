@@ -325,7 +325,7 @@ class ShardOrigins:
     """
 
     def __init__(self, shards: Sequence[Shard]) -> None:
-        """Number the solves of several files.
+        """Assign consecutive numbers to the solves of several files.
 
         Raises:
             LogError: A solve is in two files, the files hold too many solves, or the metadata of a

@@ -16,7 +16,7 @@ from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import EXTRA_ARRAY_NAMES
+from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import Event
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.renamed import warn_renamed
