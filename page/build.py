@@ -25,7 +25,7 @@ import casadi_ik as ik
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import close_view, link_styles, overview, scene_with_object
 from casadi_ik.collision.solids import EXPORTED_KINDS, primitive_solids, solid_to_dict
-from casadi_ik.export.project import checked_prefix, wasm_project, write_folder
+from casadi_ik.export.project import export_prefix, wasm_project, write_folder
 from casadi_ik.model.load_grasp import shipped_grasps
 from casadi_ik.model.objects import load_object
 
@@ -169,7 +169,7 @@ def build_robot(name: str, out: Path, keep_folder: Path | None) -> dict[str, Any
         keep_folder: Folder in which the exported module is kept; None: it is not kept.
     """
     robot = ik.load_robot(name)
-    prefix = checked_prefix(None, name)
+    prefix = export_prefix(None, name)
     data = robot_data(robot, name)
     with tempfile.TemporaryDirectory() as folder:
         folder_of_robot = (keep_folder or Path(folder)) / prefix

@@ -28,7 +28,7 @@ from casadi_ik.compile import libraries
 from casadi_ik.compile.compiler import FLAGS, ZIG, Compiler
 from casadi_ik.compile.function_kernel import machine_lanes
 from casadi_ik.compile.graphs import package_sources
-from casadi_ik.export.project import uses
+from casadi_ik.export.project import kernel_uses
 
 ROBOTS = {
     "kuka_lwr_barrett": "the package's own examples; Qiu & Kermani 2021",
@@ -93,7 +93,7 @@ def texts_of(robots: Sequence[str], everything: bool) -> list[Text]:
             os.environ["CASADI_IK_LANES"] = str(width)
             for name in robots:
                 robot = ik.load_robot(name)
-                for purpose, use in uses(robot, everything):
+                for purpose, use in kernel_uses(robot, everything):
                     use()
                     say(f"{name}, {width} lanes: {purpose}")
         del os.environ["CASADI_IK_LANES"]

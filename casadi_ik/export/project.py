@@ -1,6 +1,6 @@
 """C projects and WebAssembly modules of a robot's solver, and kernels compiled ahead of use.
 
-A folder is written under a temporary name beside its final place, and renamed when complete.
+A folder is written under a temporary name next to its final path, and renamed when complete.
 """
 
 from __future__ import annotations
@@ -24,45 +24,45 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError, os_errors
 from casadi_ik.export.multi_arm_scene import MultiArmSceneSources
 from casadi_ik.export.scene import SceneSources
-from casadi_ik.export.single import SinglePrecision, filled
-from casadi_ik.export.solver import FollowSources, SolverSources, hand_first
+from casadi_ik.export.single import SinglePrecision, render_template
+from casadi_ik.export.solver import FollowSources, SolverSources, prepared_method
 from casadi_ik.export.targets import (
-    COUNT,
-    IN_TEST_C,
-    IN_TEST_MJS,
-    IN_TEST_SINGLE,
-    OF_BODY_C,
-    OF_BODY_MJS,
-    Example,
+    MULTI_ARM_TEST_C,
+    MULTI_ARM_TEST_MJS,
+    SCENE_TEST_C,
+    SCENE_TEST_MJS,
+    SCENE_TEST_SINGLE,
+    TARGET_COUNT,
+    ExampleTarget,
     SceneTargets,
-    example,
+    c_array,
+    example_target,
     frames_header,
-    stored,
+    stored_targets,
     targets_header,
-    written,
 )
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.planning.touch.library import touch_library
 
-MARK = ".casadi_ik_export"
+EXPORT_MARKER = ".casadi_ik_export"
 """Name of the file that identifies a folder as an export."""
 
-EXPORTED = ("hand-first",)
+EXPORTABLE_METHODS = ("hand-first",)
 """Names of the methods that can be exported."""
 
 IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 
 
-def checked_prefix(prefix: str | None, robot: str) -> str:
+def export_prefix(prefix: str | None, robot: str) -> str:
     """Return the prefix of all exported names; by default it is derived from the robot's name.
 
     Raises:
         InputError: The prefix is not an identifier of C.
     """
     if prefix is None:
-        made = re.sub(r"\W+", "_", robot, flags=re.ASCII).strip("_").lower()
-        return made if IDENTIFIER.fullmatch(made) else f"robot_{made}"
+        identifier = re.sub(r"\W+", "_", robot, flags=re.ASCII).strip("_").lower()
+        return identifier if IDENTIFIER.fullmatch(identifier) else f"robot_{identifier}"
     if not IDENTIFIER.fullmatch(prefix):
         raise InputError(f"--prefix: found {prefix!r}, expected letters, digits and underscores")
     return prefix
@@ -72,16 +72,17 @@ def check_method(method: str) -> None:
     """Check that a method can be exported.
 
     Raises:
-        UnsupportedError: It cannot.
+        UnsupportedError: The method cannot be exported.
     """
-    if method not in EXPORTED:
+    if method not in EXPORTABLE_METHODS:
         raise UnsupportedError(
-            f"--method: {method!r} cannot be exported, expected one of {', '.join(EXPORTED)}"
+            f"--method: {method!r} cannot be exported, expected one of "
+            f"{', '.join(EXPORTABLE_METHODS)}"
         )
 
 
 def check_folder(out: Path) -> None:
-    """Check that a folder may be written: it does not exist, is empty, or is an export.
+    """Check that a folder may be written: it is missing, empty, or an earlier export.
 
     Raises:
         InputError: The path is another file or folder.
@@ -91,49 +92,49 @@ def check_folder(out: Path) -> None:
             raise InputError(
                 f"--out: {out} is not a folder; expected a new one or an earlier export"
             )
-        if out.is_dir() and any(out.iterdir()) and not (out / MARK).is_file():
+        if out.is_dir() and any(out.iterdir()) and not (out / EXPORT_MARKER).is_file():
             raise InputError(
                 f"--out: {out} is not empty and not an earlier export; nothing was written"
             )
 
 
 @dataclass(frozen=True, eq=False)
-class Exported:
-    """The sources of an exported solver, and the data of its tests.
+class ExportedSolver:
+    """Sources of an exported solver, and the data of its tests.
 
     Attributes:
-        solver: Solver in Python, whose answers the export reproduces.
+        solver: Solver in Python, whose solutions the export reproduces.
         example: Target of the example program.
         marks: Substitutes of the template marks.
         sources: Headers and C files by path.
-        scene: Scene of the test targets; None: the export does not check collisions.
-        judge: Files of double-precision kinematics that verify single-precision answers.
+        scene: Scene of the test targets; None: no collision check.
+        judge: Files of double-precision kinematics that verify single-precision solutions.
     """
 
     solver: Solver
-    example: Example
+    example: ExampleTarget
     marks: dict[str, str]
     sources: dict[str, str]
     scene: SceneTargets | None
     judge: dict[str, str]
 
 
-def exported(
+def export_solver(
     robot: ArmHand,
     prefix: str,
     capacity: int | None = None,
     single: bool = False,
     follow: bool = False,
-    count: int = COUNT,
-) -> Exported:
+    count: int = TARGET_COUNT,
+) -> ExportedSolver:
     """Return the solver of a robot as source code.
 
     Args:
         robot: The robot.
         prefix: Prefix of every public name.
-        capacity: Largest number of solids in the scene; None: collisions are not checked.
-        single: Whether to compute in single precision.
-        follow: Whether to add a follower of moving contacts; double precision only.
+        capacity: Maximum number of solids in the scene; None: no collision check.
+        single: True to compute in single precision.
+        follow: True to add a follower of moving contacts; double precision only.
         count: Number of targets that the test of the export solves.
 
     Raises:
@@ -149,56 +150,56 @@ def exported(
         )
     if single and follow:
         raise UnsupportedError("--follow: computes in double precision; expected no --single")
-    method, solver = hand_first(robot), Solver(robot)
+    method, solver = prepared_method(robot), Solver(robot)
     if not method.kernel.compiled:
         raise UnsupportedError(
-            "export: no C compiler is installed, which computes the answers of the test; "
+            "export: a C compiler is required to compute the solutions of the test; "
             "pip install 'casadi-ik[compiler]' installs one"
         )
-    allowing = SinglePrecision(robot) if single else None
+    precision = SinglePrecision(robot) if single else None
     scene = None
     if capacity is not None:
         sources_class = MultiArmSceneSources if robot.description.sides else SceneSources
-        scene = sources_class.for_robot(robot, method, prefix, capacity, allowing)
+        scene = sources_class.for_robot(robot, method, prefix, capacity, precision)
     tolerance = next(iter(solver.tolerances.values()))
-    sources = SolverSources(robot, method, prefix, tolerance, scene, allowing)
-    shown = example(robot)
+    sources = SolverSources(robot, method, prefix, tolerance, scene, precision)
+    target = example_target(robot)
     marks = sources.substitutes | {
-        "EXAMPLE_WHAT": shown.what,
-        "EXAMPLE_POINTS": written(shown.points),
-        "EXAMPLE_NORMALS": written(shown.normals),
+        "EXAMPLE_WHAT": target.description,
+        "EXAMPLE_POINTS": c_array(target.points),
+        "EXAMPLE_NORMALS": c_array(target.normals),
         "TARGETS": str(count),
         "ROUNDS_COUNT": str(sources.plan.rounds),
     }
-    more: dict[str, str] = {}
+    follower_files: dict[str, str] = {}
     if follow:
-        more, about_it = FollowSources(_as_hand(robot), prefix, tolerance).files()
-        marks |= about_it
+        follower_files, follower_marks = FollowSources(_as_hand(robot), prefix, tolerance).files()
+        marks |= follower_marks
     files = (
-        more
+        follower_files
         | sources.side_files
         | {
-            f"include/{prefix}.h": filled("solver.h", marks),
-            f"src/{prefix}_parts.h": filled("parts.h", marks),
-            f"src/{prefix}_solver.c": filled("solver.c", marks),
+            f"include/{prefix}.h": render_template("solver.h", marks),
+            f"src/{prefix}_parts.h": render_template("parts.h", marks),
+            f"src/{prefix}_solver.c": render_template("solver.c", marks),
             f"src/{prefix}_tables.c": sources.tables(),
-            **{f"src/{prefix}_{part.name}.c": part.text for part in sources.parts},
+            **{f"src/{prefix}_{kernel.name}.c": kernel.text for kernel in sources.kernels},
         }
     )
     if scene is not None:
         files[f"src/{prefix}_scene.c"] = scene.source()
-    about = None if capacity is None else SceneTargets(solver, capacity)
+    test_scene = None if capacity is None else SceneTargets(solver, capacity)
     judge = sources.judge() if single else {}
-    return Exported(solver, shown, marks, sources.final(files), about, judge)
+    return ExportedSolver(solver, target, marks, sources.in_precision(files), test_scene, judge)
 
 
 def _as_hand(robot: ArmHand) -> ArmHand:
-    """Return the robot itself, or a robot with several arms as one hand that has all motors."""
+    """Return the robot; for a multi-arm robot, a hand with all of its motors."""
     return ArmHand(robot.description.as_hand) if robot.description.sides else robot
 
 
-def _tested(project: Exported, pieces: Mapping[str, str]) -> dict[str, str]:
-    """Return the substitutes of the template marks; with a scene including those of its test."""
+def _test_marks(project: ExportedSolver, pieces: Mapping[str, str]) -> dict[str, str]:
+    """Return the substitutes of the template marks, with those of the test in a scene."""
     if project.scene is None:
         return project.marks
     prefix = project.marks["PREFIX"]
@@ -215,22 +216,22 @@ def c_project(
     capacity: int | None = None,
     single: bool = False,
     follow: bool = False,
-    count: int = COUNT,
+    count: int = TARGET_COUNT,
 ) -> dict[str, str | bytes]:
     """Return the files of a C project by path.
 
     Args:
         robot: The robot.
         prefix: Prefix of every public name.
-        capacity: Largest number of solids in the scene; None: collisions are not checked.
-        single: Whether to compute in single precision.
-        follow: Whether to add a follower of moving contacts; double precision only.
+        capacity: Maximum number of solids in the scene; None: no collision check.
+        single: True to compute in single precision.
+        follow: True to add a follower of moving contacts; double precision only.
         count: Number of targets that the test of the project solves.
 
     Raises:
         UnsupportedError: The robot's solver cannot be exported.
     """
-    project = exported(robot, prefix, capacity, single, follow, count)
+    project = export_solver(robot, prefix, capacity, single, follow, count)
     files = {
         "example/main.c": "main.c",
         "test/test.c": "test_single.c" if single else "test.c",
@@ -239,12 +240,12 @@ def c_project(
         "Makefile": "Makefile",
         "README.md": "README.md",
     }
-    of_body = OF_BODY_C if robot.description.sides else {}
-    marks = _tested(project, IN_TEST_SINGLE if single else IN_TEST_C | of_body)
+    multi_arm_marks = MULTI_ARM_TEST_C if robot.description.sides else {}
+    marks = _test_marks(project, SCENE_TEST_SINGLE if single else SCENE_TEST_C | multi_arm_marks)
     return {
         **project.sources,
-        f"include/{prefix}.hpp": filled("solver.hpp", marks),
-        **{path: filled(name, marks) for path, name in files.items()},
+        f"include/{prefix}.hpp": render_template("solver.hpp", marks),
+        **{path: render_template(name, marks) for path, name in files.items()},
         **project.judge,
         "test/targets.h": targets_header(project.solver, project.scene, single, count)
         + (frames_header(Solver(_as_hand(robot))) if follow else ""),
@@ -260,33 +261,35 @@ def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
     check_folder(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
         try:
             for name, content in files.items():
-                path = made / name
+                path = temporary / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 data = content.encode() if isinstance(content, str) else content
                 path.write_bytes(data)
-            (made / MARK).write_text("casadi-ik export wrote this folder and may replace it.\n")
-            made.chmod(0o755)
-            old = made.with_name(made.name + ".old")
+            (temporary / EXPORT_MARKER).write_text(
+                "casadi-ik export wrote this folder and may replace it.\n"
+            )
+            temporary.chmod(0o755)
+            replaced = temporary.with_name(temporary.name + ".old")
             if out.exists():
-                out.rename(old)
+                out.rename(replaced)
             try:
-                made.rename(out)
+                temporary.rename(out)
             except OSError:
-                if old.exists():
-                    old.rename(out)
+                if replaced.exists():
+                    replaced.rename(out)
                 raise
-            shutil.rmtree(old, ignore_errors=True)
+            shutil.rmtree(replaced, ignore_errors=True)
         except BaseException:
-            shutil.rmtree(made, ignore_errors=True)
+            shutil.rmtree(temporary, ignore_errors=True)
             raise
     except OSError as error:
         raise InputError(f"--out: {out}: cannot be written: {error.strerror}") from error
 
 
-# Fused multiply-adds would change the last bits of the answers.
+# Fused multiply-adds would change the last bits of the solutions.
 COMMAND = (
     *("-m", "ziglang", "cc", "-target", "wasm32-wasi", "-mexec-model=reactor", "-std=c11"),
     *("-O2", "-msimd128", "-ffp-contract=off", "-fno-math-errno", "-fno-sanitize=all", "-s"),
@@ -305,9 +308,9 @@ def wasm_project(
     """
     if importlib.util.find_spec("ziglang") is None:
         raise MissingExtraError("--target wasm needs ziglang: pip install 'casadi-ik[compiler]'")
-    project = exported(robot, prefix, capacity, follow=follow)
-    of_body = OF_BODY_MJS if robot.description.sides else {}
-    marks = _tested(project, IN_TEST_MJS | of_body) | {
+    project = export_solver(robot, prefix, capacity, follow=follow)
+    multi_arm_marks = MULTI_ARM_TEST_MJS if robot.description.sides else {}
+    marks = _test_marks(project, SCENE_TEST_MJS | multi_arm_marks) | {
         "LOWER_JSON": json.dumps(robot.lower.tolist()),
         "UPPER_JSON": json.dumps(robot.upper.tolist()),
         "HOME_JSON": json.dumps(robot.home.tolist()),
@@ -322,12 +325,12 @@ def wasm_project(
         "README.md": "README_wasm.md",
     }
     package = {"name": prefix, "type": "module", "main": f"{prefix}.js"}
-    about = {} if project.scene is None else {"scene.json": project.scene.json()}
+    scene_file = {} if project.scene is None else {"scene.json": project.scene.json()}
     return {
-        **about,
-        **{path: filled(name, marks) for path, name in files.items()},
+        **scene_file,
+        **{path: render_template(name, marks) for path, name in files.items()},
         "package.json": json.dumps(package) + "\n",
-        "targets.json": json.dumps(stored(project.solver, project.scene)) + "\n",
+        "targets.json": json.dumps(stored_targets(project.solver, project.scene)) + "\n",
         f"{prefix}.wasm": _module(project),
     }
 
@@ -337,36 +340,40 @@ def _numbers(values: list[float]) -> str:
     return "[" + ", ".join("NaN" if value != value else repr(value) for value in values) + "]"
 
 
-def _module(project: Exported) -> bytes:
+def _module(project: ExportedSolver) -> bytes:
     """Compile the sources to WebAssembly.
 
     Raises:
         KernelError: The compilation failed.
     """
     with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder)
+        root = Path(folder)
         for name, text in project.sources.items():
-            path = place / name
+            path = root / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
-        (place / "src" / "wasm.c").write_text(filled("wasm.c", project.marks), encoding="utf-8")
-        made = place / "solver.wasm"
-        texts = sorted(str(path) for path in (place / "src").glob("*.c"))
-        include = [f"-I{place / 'include'}", f"-I{place / 'src'}"]
-        command = [sys.executable, *COMMAND, *include, *texts, "-lm", "-o", str(made)]
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
-        if done.returncode or not made.is_file():
-            complaint = "; ".join(done.stderr.splitlines()[:3]) or "no message"
+        (root / "src" / "wasm.c").write_text(
+            render_template("wasm.c", project.marks), encoding="utf-8"
+        )
+        module = root / "solver.wasm"
+        texts = sorted(str(path) for path in (root / "src").glob("*.c"))
+        include = [f"-I{root / 'include'}", f"-I{root / 'src'}"]
+        command = [sys.executable, *COMMAND, *include, *texts, "-lm", "-o", str(module)]
+        result = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        if result.returncode or not module.is_file():
+            complaint = "; ".join(result.stderr.splitlines()[:3]) or "no message"
             raise KernelError(f"zig could not compile the WebAssembly module: {complaint[:500]}")
-        return made.read_bytes()
+        return module.read_bytes()
 
 
-def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callable[[], object]]]:
-    """Yield the uses of a robot that compile kernels: a description, and a function that runs it.
+def kernel_uses(
+    robot: ArmHand, everything: bool = False
+) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield the uses of a robot that compile kernels, each with its description and a function.
 
     Args:
         robot: The robot.
-        everything: Whether to include scenes, choices, motions and diagnoses.
+        everything: True to include scenes, choices, motions and diagnoses.
     """
     solver = Solver(robot)
     q = robot.random(np.random.default_rng(0), 64)  # enough targets for vectorised solves
@@ -380,9 +387,9 @@ def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callab
         pairs = zip(robot.fingers, points, normals, strict=True)
         return Grasp({name: Contact(*pair) for name, *pair in pairs})
 
-    def logged() -> object:
-        with tempfile.TemporaryDirectory() as place:
-            return solver.solve_batch(*targets(), log=Path(place) / "log.mcap")
+    def solve_with_log() -> object:
+        with tempfile.TemporaryDirectory() as folder:
+            return solver.solve_batch(*targets(), log=Path(folder) / "log.mcap")
 
     yield "forward kinematics", targets
     yield "one target", lambda: solver.solve(grasp())
@@ -392,18 +399,18 @@ def uses(robot: ArmHand, everything: bool = False) -> Iterator[tuple[str, Callab
     if not everything:
         return
 
-    def beyond() -> object:
+    def diagnose_unreachable() -> object:
         points, normals = targets()
         return solver.solve_batch(points[:1] + 100.0, normals[:1], diagnose=True)
 
     yield "real-time loops", solver.fast
-    yield "logs", logged
-    yield "diagnoses", beyond
+    yield "logs", solve_with_log
+    yield "diagnoses", diagnose_unreachable
     yield "followers", lambda: solver.follow(q[0], period=0.001)(grasp())
     try:
-        about = Solver(robot, scene=Scene())
+        scene_solver = Solver(robot, scene=Scene())
     except UnsupportedError:
         return
-    yield "scenes", lambda: about.solve_batch(*targets())
-    yield "choices", lambda: about.choose([grasp()] * 2, limit=1)
-    yield "ways to a grasp", lambda: about.reach(grasp(), q0=q[1])
+    yield "scenes", lambda: scene_solver.solve_batch(*targets())
+    yield "choices", lambda: scene_solver.choose([grasp()] * 2, limit=1)
+    yield "ways to a grasp", lambda: scene_solver.reach(grasp(), q0=q[1])

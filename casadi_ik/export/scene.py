@@ -17,7 +17,7 @@ from casadi_ik.compile.codegen import define, define_arrays, driver_text, number
 from casadi_ik.compile.function_kernel import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph
 from casadi_ik.errors import UnsupportedError
-from casadi_ik.export.single import ARM_ROUNDING, SinglePrecision, filled
+from casadi_ik.export.single import ARM_ROUNDING, SinglePrecision, render_template
 from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import ArmFamily
@@ -242,25 +242,25 @@ class SceneSources:
         real = marks["REAL"]
         scratch_type = "double" if self.single is None else "int64_t"
         wasm, js, types = (
-            filled(name, marks) for name in ("scene_wasm.c", "scene.js", "scene.d.ts")
+            render_template(name, marks) for name in ("scene_wasm.c", "scene.js", "scene.d.ts")
         )
         return {
-            "SCENE_TYPES": filled("scene_types.h", marks),
-            "SCENE_CALLS": filled("scene_calls.h", marks),
+            "SCENE_TYPES": render_template("scene_types.h", marks),
+            "SCENE_CALLS": render_template("scene_calls.h", marks),
             "SCENE_FIELDS": (
                 f"  {real} clearance; /* [m], negative in collision */\n"
                 "  int64_t nearest[2]; /* indices of links, or -1 - number of a solid */\n"
                 f"  {self.prefix}_scene scene;\n"
             ),
             "SCENE_SCRATCH": f"  {scratch_type} scratch[{self.scratch}];\n",
-            "SCENE_SEARCH": filled("scene_search.c", marks),
+            "SCENE_SEARCH": render_template("scene_search.c", marks),
             "SCENE_INIT": f"  {self.prefix}_scene_init(solver);\n",
             "SCENE_BEGIN": self.begin,
             "SCENE_WASM": wasm,
             "SCENE_JS": js,
             "SCENE_DTS": types,
-            "SCENE_SHAPES_JS": filled("scene_shapes.js", marks),
-            "SCENE_SHAPES_DTS": filled("scene_shapes.d.ts", marks),
+            "SCENE_SHAPES_JS": render_template("scene_shapes.js", marks),
+            "SCENE_SHAPES_DTS": render_template("scene_shapes.d.ts", marks),
             "SCENE_STATUS_TYPE": " | 6",
             "SCENE_STATUS_JS": "  COLLISION: 6,\n",
             "SCENE_STATUS_DTS": (
@@ -268,7 +268,7 @@ class SceneSources:
                 "  readonly COLLISION: 6;\n"
             ),
             "SCENE_ANSWER_JS": (
-                "      clearance: this._wasm.least(),\n      closest: this.closest(),\n"
+                "      clearance: this._wasm.last_clearance(),\n      closest: this.closest(),\n"
             ),
             "SCENE_ANSWER_DTS": (
                 "  /** Clearance [m] and the nearest pair: links, or a link and `solid N`. */\n"
@@ -285,7 +285,7 @@ class SceneSources:
             "ARM_SEARCH": driver_text("arm_search") if self.closed_arms else "",
             **self.arm_marks,
         }
-        return filled("scene.c", marks)
+        return render_template("scene.c", marks)
 
     def jobs(self) -> str:
         """Return the declarations of collision checks, for all files of the solver."""

@@ -1,4 +1,4 @@
-"""Template rendering, and the substitutes for double and single precision."""
+"""Rendering of templates, and their substitutes for double and single precision."""
 
 from __future__ import annotations
 
@@ -28,37 +28,38 @@ TOKEN = re.compile(
     re.VERBOSE | re.MULTILINE | re.DOTALL,
 )
 
-_TURNS = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
-_OTHERS = ("exp", "log", "log10", "pow", "sqrt", "hypot", "fabs", "floor", "ceil", "fmod", "fmax")
-LIBM = frozenset((*_TURNS, *_OTHERS, "fmin", "rint", "round", "copysign", "frexp", "ldexp"))
+_TRIGONOMETRIC = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh")
+_ELEMENTARY = ("exp", "log", "log10", "pow", "sqrt", "hypot", "fabs", "fmod", "frexp", "ldexp")
+_ROUNDING_FUNCTIONS = ("floor", "ceil", "rint", "round", "fmax", "fmin", "copysign")
+LIBM = frozenset((*_TRIGONOMETRIC, *_ELEMENTARY, *_ROUNDING_FUNCTIONS))
 """Functions of the C library whose single-precision variants have the suffix f."""
 
 FLOAT = np.finfo(np.float32)
 EPSILON = float(FLOAT.eps)
 
-ROUNDING = 8 * EPSILON
+SINGLE_ROUNDING = 8 * EPSILON
 """Bound of the rounding error of kinematics: an angle [rad], and a fraction of the robot's reach.
 
 Source: three times the largest error in 20,000 random solves of kuka_lwr_barrett and
 panda+allegro_right."""
 
-ARM_ROUNDING = 16 * ROUNDING
+ARM_ROUNDING = 16 * SINGLE_ROUNDING
 """Bound of the rounding error of arm joints that are computed from the pose of the palm [rad].
 
-A joint at a limit may exceed it by this amount, and is then clamped."""
+A joint at a limit may exceed the limit by this amount, and is then clipped."""
 
-FOLLOWING = ((FIT.exact * FIT.exact, ARM_ROUNDING * ARM_ROUNDING),)
+REPLACED_THRESHOLDS = ((FIT.exact * FIT.exact, ARM_ROUNDING * ARM_ROUNDING),)
 """Thresholds in the graphs that are replaced in single precision: pairs of old and new values.
 
-A fit or an arm whose cost is below the threshold is exact. Single precision does not reach the
-value of double precision, and would search an arm from every start, in thirteen times as many
-iterations.
+A fit or an arm counts as exact if its cost is below the threshold. Single precision does not reach
+the threshold of double precision; with it, the arm would be searched from every start, in 13 times
+as many iterations.
 """
 
-SMALL, LARGE = 1e-15, 1e15
+SMALL_LENGTH, LARGE_LENGTH = 1e-15, 1e15
 """Lengths between these have squares that neither underflow nor overflow."""
 
-SAMPLES = 1024
+REACH_SAMPLES = 1024
 """Number of random configurations that estimate the reach of a robot."""
 
 
@@ -93,7 +94,7 @@ def _number(text: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class SinglePrecision:
-    """Allowances for rounding, with which double precision confirms answers in single precision.
+    """Allowances for rounding, so that solutions in single precision pass the check in double.
 
     Attributes:
         robot: The robot.
@@ -104,26 +105,26 @@ class SinglePrecision:
     @cached_property
     def reach(self) -> float:
         """Largest distance of a contact from the origin of the base frame [m]."""
-        points, _ = self.robot.contacts(self.robot.random(np.random.default_rng(0), SAMPLES))
+        points, _ = self.robot.contacts(self.robot.random(np.random.default_rng(0), REACH_SAMPLES))
         return float(np.linalg.norm(points, axis=-1).max())
 
     @property
     def tolerance(self) -> Tolerance:
-        """Rounding error by which tolerances are reduced."""
-        return Tolerance(ROUNDING * self.reach, ROUNDING)
+        """Rounding errors, by which tolerances are reduced."""
+        return Tolerance(SINGLE_ROUNDING * self.reach, SINGLE_ROUNDING)
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
-        """The robot's limits (n,), moved inwards by the rounding error; exact in single precision.
+        """Limits (n,), tightened by the rounding error and exact in single precision.
 
         Raises:
             UnsupportedError: A range is smaller than the rounding error.
         """
         lower, upper = self.robot.lower, self.robot.upper
-        low = (lower + ROUNDING * np.maximum(1.0, np.abs(lower))).astype(np.float32)
-        high = (upper - ROUNDING * np.maximum(1.0, np.abs(upper))).astype(np.float32)
-        for name, one, other in zip(self.robot.actuators, low, high, strict=True):
-            if one >= other:
+        low = (lower + SINGLE_ROUNDING * np.maximum(1.0, np.abs(lower))).astype(np.float32)
+        high = (upper - SINGLE_ROUNDING * np.maximum(1.0, np.abs(upper))).astype(np.float32)
+        for name, lowest, highest in zip(self.robot.actuators, low, high, strict=True):
+            if lowest >= highest:
                 raise UnsupportedError(
                     f"--single: the range of motor {name!r} is too small for single precision"
                 )
@@ -135,8 +136,8 @@ class SinglePrecision:
         return {
             "LIMIT_SLACK": 0.0,
             "TOLERANCE_SLACK": 0.0,
-            "SMALL_LENGTH": SMALL,
-            "LARGE_LENGTH": LARGE,
+            "SMALL_LENGTH": SMALL_LENGTH,
+            "LARGE_LENGTH": LARGE_LENGTH,
         }
 
     @property
@@ -146,50 +147,50 @@ class SinglePrecision:
         return {"LOWER": lower, "UPPER": upper}
 
 
-IN_DOUBLE = {
+DOUBLE_PRECISION = {
     "REAL": "double",
     "MATHS": "#include <math.h>",
     "AND_SUM": ", sum = 0;",
     "ANSWERS": (
-        "Answers are bit for bit those of the Python package (method hand-first) on machines with "
-        "IEEE 754\narithmetic, at any optimisation level, without fused multiply-adds "
-        "(`-ffp-contract=off`).\n"
+        "Solutions agree bit for bit with those of the Python package (method hand-first) on "
+        "machines with\nIEEE 754 arithmetic, at any optimisation level, without fused "
+        "multiply-adds\n(`-ffp-contract=off`).\n"
     ),
-    "COMPARED": "and compares the answers bit for bit with those of Python",
+    "COMPARED": "and compares the solutions bit for bit with those of Python",
 }
 """Substitutes of the template marks in double precision."""
 
-ANSWERS = """\
-This project is in single precision, for controllers without double-precision arithmetic. Answers
-that it reports as solved are solved in double precision as well; see [below](#single-precision).
+SINGLE_PRECISION_SUMMARY = """\
+This project computes in single precision, for controllers without double-precision arithmetic.
+Targets reported as solved are also solved in double precision; see [below](#single-precision).
 """
 
-ABOUT = """
+SINGLE_PRECISION_PAGE = """
 ## Single precision
 
-Every number is a `float`, and nothing is computed in double precision (`-Wdouble-promotion` checks
+Every number is a `float`, and no operation is in double precision (`-Wdouble-promotion` checks
 this). The method is that of the double-precision export, with thresholds adapted to single
-precision. Iterates differ, so that the answer may be another one where a target has several.
+precision. Iterates differ, so that a target with several solutions may get a different one.
 
 Rounding moves the fingertips of this robot by less than {position:.1e} m and {angle:.1e} rad. The
-solver reduces tolerances by these amounts and moves limits inwards by {angle:.1e} rad. Therefore an
-answer that is reported as solved is solved in double precision as well. Use tolerances of
+solver reduces tolerances by these amounts and moves limits inwards by {angle:.1e} rad. A target
+that is reported as solved is therefore also solved in double precision. Use tolerances of
 {least:.1g} m and {least_angle:.1g} rad or more; tolerances below the rounding error are never met.
 
-`make test` solves the stored targets. It fails if an answer that is reported as solved violates
+`make test` solves the stored targets. It fails if a solution that is reported as solved violates
 a tolerance or a limit in double precision (`test/judge.c`), or if more than one in a thousand of
 the targets that double precision solves is missed.
 """
 
 
-def in_single(single: SinglePrecision) -> dict[str, str]:
+def single_precision_substitutes(single: SinglePrecision) -> dict[str, str]:
     """Return the substitutes of the template marks in single precision."""
-    less = single.tolerance
-    about = ABOUT.format(
-        position=less.position,
-        angle=less.angle,
-        least=100 * less.position,
-        least_angle=100 * less.angle,
+    reduction = single.tolerance
+    page = SINGLE_PRECISION_PAGE.format(
+        position=reduction.position,
+        angle=reduction.angle,
+        least=100 * reduction.position,
+        least_angle=100 * reduction.angle,
     )
     return {
         "REAL": "float",
@@ -197,34 +198,36 @@ def in_single(single: SinglePrecision) -> dict[str, str]:
         "AS_DOUBLE": "(double) ",
         "TO_REAL": "(float) ",
         "AND_SUM": ";\n  double sum = 0;",
-        "LESS_POSITION": f" - {number(less.position)}",
-        "LESS_ANGLE": f" - {number(less.angle)}",
+        "LESS_POSITION": f" - {number(reduction.position)}",
+        "LESS_ANGLE": f" - {number(reduction.angle)}",
         "STRICTER": " -Wdouble-promotion",
         "JUDGE": " test/judge.c",
         "PRECISION": ", single precision",
         "PRECISION_NOTE": (
             " *\n * Single precision: the solver reduces tolerances by the rounding error,\n"
-            f" * {less.position:.1e} m and {less.angle:.1e} rad.\n"
+            f" * {reduction.position:.1e} m and {reduction.angle:.1e} rad.\n"
         ),
-        "ANSWERS": ANSWERS,
-        "COMPARED": "and verifies the answers in double precision",
-        "ABOUT_PRECISION": about,
+        "ANSWERS": SINGLE_PRECISION_SUMMARY,
+        "COMPARED": "and verifies the solutions in double precision",
+        "ABOUT_PRECISION": page,
     }
 
 
-MARK = re.compile(r"@([A-Z_]+)(\??)@")
-SECTION = re.compile(r"^@([A-Z_]+)\{@\n(.*?)^@\}@\n", re.MULTILINE | re.DOTALL)
+TEMPLATE_MARK = re.compile(r"@([A-Z_]+)(\??)@")
+TEMPLATE_SECTION = re.compile(r"^@([A-Z_]+)\{@\n(.*?)^@\}@\n", re.MULTILINE | re.DOTALL)
 
 
-def filled(name: str, substitutes: Mapping[str, str]) -> str:
+def render_template(name: str, substitutes: Mapping[str, str]) -> str:
     """Return the text of `templates/<name>` with all marks replaced.
 
     A mark `@NAME?@` is optional: it is removed if there is no substitute. Lines between `@NAME{@`
-    and `@}@` are kept only if there is a substitute for NAME.
+    and `@}@` are omitted unless there is a substitute for NAME.
 
     Raises:
         KeyError: A mark that is not optional has no substitute.
     """
     text = (resources.files("casadi_ik.export") / "templates" / name).read_text(encoding="utf-8")
-    text = SECTION.sub(lambda m: m[2] if m[1] in substitutes else "", text)
-    return MARK.sub(lambda m: substitutes.get(m[1], "") if m[2] else substitutes[m[1]], text)
+    text = TEMPLATE_SECTION.sub(lambda m: m[2] if m[1] in substitutes else "", text)
+    return TEMPLATE_MARK.sub(
+        lambda m: substitutes.get(m[1], "") if m[2] else substitutes[m[1]], text
+    )

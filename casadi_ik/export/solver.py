@@ -1,4 +1,4 @@
-"""Sources of a solver and of a follower: rendered templates, and a file per kernel."""
+"""Sources of an exported solver and follower: rendered templates, and one file per kernel."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from casadi_ik.compile.layout import Layout
 from casadi_ik.compile.lookup import TILE
 from casadi_ik.export.scene import WITHOUT_SCENE, SceneSources
 from casadi_ik.export.single import (
-    FOLLOWING,
-    IN_DOUBLE,
+    DOUBLE_PRECISION,
+    REPLACED_THRESHOLDS,
     SinglePrecision,
-    filled,
-    in_single,
     in_single_precision,
+    render_template,
+    single_precision_substitutes,
 )
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -53,17 +53,17 @@ from casadi_ik.solve.request import POSTURE_LIMIT_SLACK, contacts_from_palms
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
 
-def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
-    """Return the substitutes for solving given palms; none where contacts leave the palm free.
+def palm_substitutes(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
+    """Return the substitutes for palm targets; empty if contacts leave the palm free.
 
-    Robots without an arm, or with several arms, have none either.
+    They are empty for robots without an arm or with several arms too.
     """
     if not robot.description.arm_actuators or robot.description.sides:
         return {}
     motors = robot.description.finger_motors
-    own = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
+    hand_posture = np.where(np.isin(robot.actuators, motors), robot.home, np.nan)
     home = robot.palm(robot.home)
-    if contacts_from_palms(robot, home[None], own[None])[2]:  # contacts leave it free
+    if contacts_from_palms(robot, home[None], hand_posture[None])[2]:
         return {}
     pose = np.concatenate([home[:3, :3].ravel(), home[:3, 3]])
     constants = f"#define POSTURE_ROUNDING {number(POSTURE_LIMIT_SLACK)}\n" + define_arrays(
@@ -71,11 +71,11 @@ def palm_marks(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
     )
     marks = {"PREFIX": prefix, "GUARD": prefix.upper()}
     return {
-        "PALM_CALLS": filled("palm.h", marks | {"REAL": real}),
-        "PALM": "\n" + constants + filled("palm.c", marks),
-        "PALM_WASM": filled("palm_wasm.c", marks),
-        "PALM_JS": filled("palm.js", marks),
-        "PALM_DTS": filled("palm.d.ts", marks),
+        "PALM_CALLS": render_template("palm.h", marks | {"REAL": real}),
+        "PALM": "\n" + constants + render_template("palm.c", marks),
+        "PALM_WASM": render_template("palm_wasm.c", marks),
+        "PALM_JS": render_template("palm.js", marks),
+        "PALM_DTS": render_template("palm.d.ts", marks),
     }
 
 
@@ -94,7 +94,7 @@ class FollowSources:
     tolerance: Tolerance
 
     def files(self) -> tuple[dict[str, str], dict[str, str]]:
-        """Return the C file by path, and the substitutes of marks in the other templates."""
+        """Return the C file by path, and the substitutes of marks in other templates."""
         cycle = Cycle(self.robot.description, point_normal_kinds(len(self.robot.fingers)))
         marks = {
             "PREFIX": self.prefix,
@@ -106,12 +106,12 @@ class FollowSources:
             "FOLLOW_RECORD": str(cycle.record.size),
             "FOLLOW_TRAIL": str(recovery.CAPACITY),
         }
-        about = {
+        substitutes = {
             "FOLLOW": "",
-            "FOLLOW_CALLS": filled("follow.h", marks),
-            "FOLLOW_WASM": filled("follow_wasm.c", marks),
-            "FOLLOW_JS": filled("follow.js", marks),
-            "FOLLOW_DTS": filled("follow.d.ts", marks),
+            "FOLLOW_CALLS": render_template("follow.h", marks),
+            "FOLLOW_WASM": render_template("follow_wasm.c", marks),
+            "FOLLOW_JS": render_template("follow.js", marks),
+            "FOLLOW_DTS": render_template("follow.d.ts", marks),
             "FOLLOW_STATUS_JS": (
                 "export const FollowStatus = Object.freeze({\n"
                 "  HOLDING: 0,\n  FOLLOWING: 1,\n  LATE: 2,\n  MISSED: 3,\n});\n"
@@ -127,17 +127,19 @@ class FollowSources:
                 "};\n"
             ),
         }
-        return {f"src/{self.prefix}_follow.c": filled("follow.c", marks)}, about
+        return {f"src/{self.prefix}_follow.c": render_template("follow.c", marks)}, substitutes
 
     def _constants(self, cycle: Cycle) -> str:
         robot, f = self.robot, len(self.robot.fingers)
-        places = {
+        integers = {
             "N_FINGERS": f,
             "N_MOTORS": len(robot.actuators),
             "MOVES_PALM": int(bool(cycle.palms)),
             "TRAIL_CAPACITY": recovery.CAPACITY,
         }
-        places |= _places("STATE", cycle.state) | _places("PARAMETER", cycle.parameters)
+        integers |= _field_offsets("STATE", cycle.state) | _field_offsets(
+            "PARAMETER", cycle.parameters
+        )
         numbers = {
             "TOLERANCE_SLACK": TOLERANCE_SLACK,
             "SETTLING": SETTLING,
@@ -163,19 +165,19 @@ class FollowSources:
             "ANGLE_TOLERANCES": np.full(f, self.tolerance.angle),
         }
         return (
-            define(places | _places("RECORD", cycle.record))
+            define(integers | _field_offsets("RECORD", cycle.record))
             + "".join(f"#define {name} {number(value)}\n" for name, value in numbers.items())
             + define_arrays(arrays)
         )
 
 
-def _places(label: str, layout: Layout) -> dict[str, int]:
-    return {f"{label}_{one.name.upper()}": layout.slice(one.name).start for one in layout}
+def _field_offsets(label: str, layout: Layout) -> dict[str, int]:
+    return {f"{label}_{item.name.upper()}": layout.slice(item.name).start for item in layout}
 
 
 @dataclass(frozen=True)
-class Part:
-    """An exported kernel.
+class KernelSource:
+    """Source of an exported kernel.
 
     Attributes:
         name: Name of its file and function.
@@ -192,32 +194,32 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class SideSources:
-    """Sources that seed the hand of one side of a robot with several arms.
+    """Sources that seed the hand of one side of a multi-arm robot.
 
     Attributes:
         plan: Search of the side alone.
         solver: Prefix of the names of the robot's solver.
-        place: Index of the side.
+        index: Index of the side.
     """
 
     plan: SearchPlan
     solver: str
-    place: int
+    index: int
 
     @property
     def prefix(self) -> str:
-        """Prefix of its names."""
-        return f"{self.solver}_side_{self.place}"
+        """Prefix of the names of the side."""
+        return f"{self.solver}_side_{self.index}"
 
     @property
     def member(self) -> str:
-        """Member of the solver's struct that holds its memory."""
-        own = f"{self.plan.members()}  {self.solver}_memory *memory;\n"
-        return f"  struct {self.prefix} {{\n{own}  }} side_{self.place};\n"
+        """Member of the struct of the solver with the memory of the side."""
+        members = f"{self.plan.members()}  {self.solver}_memory *memory;\n"
+        return f"  struct {self.prefix} {{\n{members}  }} side_{self.index};\n"
 
     @property
-    def declared(self) -> str:
-        """Declaration of its function."""
+    def declaration(self) -> str:
+        """Declaration of the function that seeds the hand."""
         return (
             f"int {self.prefix}_hands(struct {self.prefix} *job, const scalar *points, "
             "const scalar *normals,\n    const scalar *q0, int64_t nearest, int64_t round, "
@@ -225,17 +227,17 @@ class SideSources:
         )
 
     @property
-    def called(self) -> str:
-        """Case of the switch that calls its function."""
+    def switch_case(self) -> str:
+        """Case of the switch statement that calls the function."""
         return (
-            f"    case {self.place}:\n"
-            f"      job->side_{self.place}.memory = &job->memory;\n"
-            f"      return {self.prefix}_hands(&job->side_{self.place}, points, normals, q0, "
+            f"    case {self.index}:\n"
+            f"      job->side_{self.index}.memory = &job->memory;\n"
+            f"      return {self.prefix}_hands(&job->side_{self.index}, points, normals, q0, "
             "nearest, round,\n                                postures);\n"
         )
 
     def source(self, names: Iterable[str]) -> str:
-        """Return the text of its file, which calls the named kernels."""
+        """Return the C file of the side, which calls the kernels with these names."""
         texts = driver_text("loops") + "".join(
             map(source_text, ("spread", "restarts", "seeds", "hands"))
         )
@@ -244,16 +246,17 @@ class SideSources:
             for name in names
         )
         return (
-            f"/* Seeds of the hand of {plain(self.plan.layouts.robot.name)}. */\n"
+            f"/* Seeds of the hand of {sanitized_name(self.plan.layouts.robot.name)}. */\n"
             f'#include "{self.solver}_parts.h"\n\n'
             "enum { DONE = 0, SLICE_OVER = 1 };\n\n"
             f"typedef struct {self.prefix} search;\n\n"
-            f"{tiles(self.prefix, self.plan)}{calls}#define FIND_HANDS int {self.prefix}_hands\n"
+            f"{table_macro(self.prefix, self.plan)}{calls}"
+            f"#define FIND_HANDS int {self.prefix}_hands\n"
             f"{define(self.plan.sizes)}{self.plan.constants(texts)}{texts}"
         )
 
 
-HANDS_OF = """\
+HANDS_DISPATCH = """\
 static int hands_of(search *job, int side, const scalar *points, const scalar *normals,
                     const scalar *q0, int64_t nearest, int64_t round, scalar *postures) {
   switch (side) {
@@ -264,8 +267,8 @@ static int hands_of(search *job, int side, const scalar *points, const scalar *n
 """
 
 
-def tiles(prefix: str, plan: SearchPlan) -> str:
-    """Return the macro that selects a lookup table; hands with repaired seeds have only one."""
+def table_macro(prefix: str, plan: SearchPlan) -> str:
+    """Return the macro that selects a lookup table; hands with repaired seeds have one table."""
     first, later = (f"{prefix}_table_{i}" for i in (0, 0 if plan.repairs_seeds else 1))
     return f"#define TILES(table) ((table) ? {later} : {first})\n"
 
@@ -279,7 +282,7 @@ class SolverSources:
         method: The method hand-first for the robot.
         prefix: Prefix of every public name.
         tolerance: Default tolerance of contacts.
-        scene: Sources of the scene; None: collisions are not checked.
+        scene: Sources of the scene; None: no collision check.
         single: Allowances for rounding; None: double precision.
     """
 
@@ -297,78 +300,82 @@ class SolverSources:
 
     @cached_property
     def sides(self) -> tuple[SideSources, ...]:
-        """Sources of the sides of a robot with several arms."""
-        return tuple(SideSources(one, self.prefix, i) for i, one in enumerate(self.plan.sides))
+        """Sources of the sides of a multi-arm robot."""
+        return tuple(SideSources(plan, self.prefix, i) for i, plan in enumerate(self.plan.sides))
 
     @property
     def _searches(self) -> dict[str, SearchPlan]:
         """Searches that look up hand seeds, by the infix of their names."""
-        found = {f"side_{side.place}_": side.plan for side in self.sides}
-        return found or {"": self.plan}
+        searches = {f"side_{side.index}_": side.plan for side in self.sides}
+        return searches or {"": self.plan}
 
     @cached_property
-    def parts(self) -> tuple[Part, ...]:
+    def kernels(self) -> tuple[KernelSource, ...]:
         """Exported kernels."""
         plan, n_state = self.plan, self.plan.layouts.state.size
         # Exports do not record iterations.
         loop = define(plan.solve.constants | {"N_RECORD": 0, "ROW_BYTES": 0})
         loop += "#define store_row(record, row) ((void) (record), (void) (row))\n"
-        parts = (
-            self._part("begin", "map", plan.begin),
-            self._part("solve", "loop", plan.solve, loop, 2 * n_state),
-            self._part("contacts", "map", plan.contacts),
-            self._part("judge", "map", plan.judge),
+        kernels = (
+            self._kernel_source("begin", "map", plan.begin),
+            self._kernel_source("solve", "loop", plan.solve, loop, 2 * n_state),
+            self._kernel_source("contacts", "map", plan.contacts),
+            self._kernel_source("judge", "map", plan.judge),
         )
         for name, search in self._searches.items():
-            parts += self._hand_parts(name, search)
-        return parts + self._scene_parts()
+            kernels += self._seed_kernels(name, search)
+        return kernels + self._scene_kernels()
 
-    def _hand_parts(self, name: str, plan: SearchPlan) -> tuple[Part, ...]:
+    def _seed_kernels(self, name: str, plan: SearchPlan) -> tuple[KernelSource, ...]:
         """Return the kernels that look up hand seeds."""
         lookup = plan.seeds.table.lookup
         tables = zip(plan.seeds.tables(enforce_limits=True), plan.seeds.table_samples, strict=False)
         rows = max(samples.count for _, samples in tables) + TILE
         # Distances of all rows and of their tiles are 32 bits each.
-        room = rows if self.single is None else rows + rows // TILE
+        work_size = rows if self.single is None else rows + rows // TILE
         constants = define(lookup.constants | {"REGISTER_BYTES": 0})
-        found = (self._part(f"{name}look_up", "lookup", lookup.key, constants, room),)
-        return found + (
-            (self._part(f"{name}finger_errors", "map", plan.seeds.finger_errors),)
+        kernels = (
+            self._kernel_source(f"{name}look_up", "lookup", lookup.key, constants, work_size),
+        )
+        return kernels + (
+            (self._kernel_source(f"{name}finger_errors", "map", plan.seeds.finger_errors),)
             if plan.repairs_seeds
             else ()
         )
 
-    def _scene_parts(self) -> tuple[Part, ...]:
+    def _scene_kernels(self) -> tuple[KernelSource, ...]:
         scene = self.scene
         if scene is None:
             return ()
         shape_poses, constants, work = scene.clearance_kernel
-        clearance = self._part("near", "clearance", shape_poses, constants, work)
-        place = filled("place.c", {"PREFIX": self.prefix})
-        parts = (replace(clearance, text=clearance.text + place),)
-        return parts + tuple(self._part(name, "map", each) for name, each in scene.maps.items())
+        clearance = self._kernel_source("near", "clearance", shape_poses, constants, work)
+        link_poses = render_template("place.c", {"PREFIX": self.prefix})
+        kernels = (replace(clearance, text=clearance.text + link_poses),)
+        return kernels + tuple(
+            self._kernel_source(name, "map", graph) for name, graph in scene.maps.items()
+        )
 
-    def _part(
+    def _kernel_source(
         self,
         name: str,
         driver: str,
         kernel: FunctionKernel | LoopKernel | FunctionGraph,
         constants: str = "",
         extra: int = 0,
-    ) -> Part:
-        of_graph = isinstance(kernel, FunctionGraph)
-        function: Any = row_major(kernel.function) if of_graph else kernel.function
+    ) -> KernelSource:
+        is_graph = isinstance(kernel, FunctionGraph)
+        function: Any = row_major(kernel.function) if is_graph else kernel.function
         if driver in ("map", "lookup"):
             constants += define({"N_IN": function.n_in(), "N_OUT": function.n_out()})
         if driver == "lookup":
             extra += function.numel_out(0)
-        before = {"clearance": "lanes_alone"}.get(driver)
-        text = driver_text(before) if before else ""
+        prerequisite = {"clearance": "lanes_alone"}.get(driver)
+        text = driver_text(prerequisite) if prerequisite else ""
         text += driver_text(driver)
         body = "".join(
             (
                 f'#include "{self.prefix}_parts.h"\n\n',
-                standalone_source(function, self.form),
+                standalone_source(function, self.code_options),
                 f"#define NAMED {self.prefix}_{name}_kernel\n",
                 f"#define MEMORY {self.prefix}_memory\n",
                 driver_text("freestanding"),
@@ -376,14 +383,14 @@ class SolverSources:
                 text,
             )
         )
-        return Part(name, f"{driver}_job", body, extra)
+        return KernelSource(name, f"{driver}_job", body, extra)
 
     @property
-    def form(self) -> CodeOptions:
+    def code_options(self) -> CodeOptions:
         """Options of the code of graphs."""
         if self.single is None:
             return CodeOptions()
-        return CodeOptions(single=True, replaced=FOLLOWING)
+        return CodeOptions(single=True, replaced=REPLACED_THRESHOLDS)
 
     @property
     def substitutes(self) -> dict[str, str]:
@@ -391,41 +398,45 @@ class SolverSources:
         robot, sizes = self.robot, self.plan.sizes
         jobs = "".join(driver_text(f"{name}_job") for name in ("loop", "map", "lookup"))
         jobs += self.scene.jobs() if self.scene else ""
-        parts = "".join(
+        declarations = "".join(
             f"int {self.prefix}_{p.name}_kernel({p.job} *job, {self.prefix}_memory *memory);\n"
-            for p in self.parts
-        ) + "".join(side.declared for side in self.sides)
+            for p in self.kernels
+        ) + "".join(side.declaration for side in self.sides)
         calls = "".join(
             f"#define {p.name.upper()}(work) {self.prefix}_{p.name}_kernel(work, &job->memory)\n"
-            for p in self.parts
+            for p in self.kernels
         )
-        about = dict(WITHOUT_SCENE) if self.scene is None else self.scene.substitutes()
-        about |= IN_DOUBLE if self.single is None else in_single(self.single)
-        about |= palm_marks(robot, self.prefix, about["REAL"])
+        substitutes = dict(WITHOUT_SCENE) if self.scene is None else self.scene.substitutes()
+        substitutes |= (
+            DOUBLE_PRECISION if self.single is None else single_precision_substitutes(self.single)
+        )
+        substitutes |= palm_substitutes(robot, self.prefix, substitutes["REAL"])
         lower, upper = self._bounds
         single = self.single
-        changed = (None, None) if single is None else (single.reals, single.arrays)
-        return about | {
+        single_constants = (None, None) if single is None else (single.reals, single.arrays)
+        return substitutes | {
             "PREFIX": self.prefix,
             "GUARD": self.prefix.upper(),
-            "ROBOT": plain(robot.name),
+            "ROBOT": sanitized_name(robot.name),
             "FINGERS": str(len(robot.fingers)),
             "MOTORS": str(len(robot.actuators)),
-            "FINGER_LIST": ", ".join(map(plain, robot.fingers)),
-            "MOTOR_LIST": ", ".join(map(plain, robot.actuators)),
+            "FINGER_LIST": ", ".join(map(sanitized_name, robot.fingers)),
+            "MOTOR_LIST": ", ".join(map(sanitized_name, robot.actuators)),
             "FINGER_NAMES": _strings(robot.fingers),
             "MOTOR_NAMES": _strings(robot.actuators),
-            "W": str(max(1, *(part.work for part in self.parts))),
+            "W": str(max(1, *(kernel.work for kernel in self.kernels))),
             "STRUCT": (self.plan.members() + "".join(side.member for side in self.sides)).rstrip(),
             "SEEDS": self._seeds(),
             "TABLES": "".join(
                 f"extern const int16_t {name}[];\n" for name in self._tables
             ).rstrip(),
             "JOBS": jobs,
-            "PARTS": parts,
+            "PARTS": declarations,
             "CALLS": calls,
             "SIZES": define(sizes),
-            "CONSTANTS": self.plan.constants(self.plan.source + "".join(about.values()), *changed),
+            "CONSTANTS": self.plan.constants(
+                self.plan.source + "".join(substitutes.values()), *single_constants
+            ),
             "SEARCH": self.plan.source,
             "TERMS": define_arrays({"TERMS": self._terms(), "HOME": robot.home}),
             "LIMITS": define_arrays(
@@ -438,8 +449,8 @@ class SolverSources:
     def _seeds(self) -> str:
         """Return the macros through which the search obtains seeds."""
         if not self.sides:
-            return tiles(self.prefix, self.plan)
-        return HANDS_OF.replace("@CASES@", "".join(side.called for side in self.sides))
+            return table_macro(self.prefix, self.plan)
+        return HANDS_DISPATCH.replace("@CASES@", "".join(side.switch_case for side in self.sides))
 
     @property
     def side_files(self) -> dict[str, str]:
@@ -448,7 +459,7 @@ class SolverSources:
 
     @cached_property
     def _tables(self) -> dict[str, NDArray[np.int16]]:
-        """Keys of the lookup tables by the names of their arrays."""
+        """Keys of the lookup tables by name of their C arrays."""
         return {
             f"{self.prefix}_{name}table_{i}": np.ascontiguousarray(table.lookup.tiles).reshape(-1)
             for name, plan in self._searches.items()
@@ -467,41 +478,47 @@ class SolverSources:
 
     def _terms(self) -> Array:
         f = len(self.robot.fingers)
-        none, allowed = np.zeros((1, f, 3)), self.tolerance
+        no_contacts, tolerance = np.zeros((1, f, 3)), self.tolerance
         layout = terms(self.robot.description)
         if self.single is not None:
-            less = self.single.tolerance
-            allowed = Tolerance(allowed.position - less.position, allowed.angle - less.angle)
-        found = self.method.terms(TargetBatch(none, none, allowed, True)).copy()
-        found[layout.slice("lower")], found[layout.slice("upper")] = self._bounds
-        return found
+            reduction = self.single.tolerance
+            tolerance = Tolerance(
+                tolerance.position - reduction.position, tolerance.angle - reduction.angle
+            )
+        terms_of_target = self.method.terms(
+            TargetBatch(no_contacts, no_contacts, tolerance, True)
+        ).copy()
+        terms_of_target[layout.slice("lower")], terms_of_target[layout.slice("upper")] = (
+            self._bounds
+        )
+        return terms_of_target
 
     def judge(self) -> dict[str, str]:
-        """Return the files of double-precision kinematics that verify answers."""
+        """Return the files of double-precision kinematics that verify solutions."""
         marks = {
             "KINEMATICS": standalone_source(self.plan.judge.function, CodeOptions()),
             "POSITION_TOLERANCE": repr(self.tolerance.position),
             "ANGLE_TOLERANCE": repr(self.tolerance.angle),
             "LIMIT_SLACK": repr(LIMIT_SLACK),
         }
-        return {f"test/{name}": filled(name, marks) for name in ("judge.c", "judge.h")}
+        return {f"test/{name}": render_template(name, marks) for name in ("judge.c", "judge.h")}
 
-    def final(self, files: dict[str, str]) -> dict[str, str]:
+    def in_precision(self, files: dict[str, str]) -> dict[str, str]:
         """Return C files in the precision of the export."""
         if self.single is None:
             return files
         return {path: in_single_precision(text) for path, text in files.items()}
 
 
-def hand_first(robot: ArmHand) -> HandFirstMethod:
-    """Return the method hand-first of a robot, with its kernels compiled."""
+def prepared_method(robot: ArmHand) -> HandFirstMethod:
+    """Return the method hand-first of a robot with compiled kernels."""
     method = HandFirstMethod(robot.description, HandFirstParameters())
     method.prepare()
     return method
 
 
-def plain(name: str) -> str:
-    """Return a name without characters that could end a comment; files are untrusted."""
+def sanitized_name(name: str) -> str:
+    """Return a name without characters that could end a comment, because files are untrusted."""
     return re.sub(r"[^\w .+-]", "_", name)
 
 

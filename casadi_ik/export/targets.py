@@ -1,4 +1,4 @@
-"""Test targets with the answers of this package, and the example of an exported solver."""
+"""Test targets with the solutions of this package, and the example of an exported solver."""
 
 from __future__ import annotations
 
@@ -27,88 +27,92 @@ from casadi_ik.solve.registry import build_method
 from casadi_ik.solve.request import Request
 from casadi_ik.solve.status import Status
 
-COUNT = 1000
+TARGET_COUNT = 1000
 """Number of targets that the test of an export solves."""
 
-UNREACHABLE = 100
-"""One in this many targets is moved out of reach, so that its solve goes through all restarts."""
+UNREACHABLE_PERIOD = 100
+"""Period of the targets that are moved out of reach, so that all restarts are tested."""
 
-SEED = 17
+TARGET_SEED = 17
+"""Seed of the random targets."""
 
-WHOLE = ("status", "iterations", "restarts")
+INTEGER_RESULTS = ("status", "iterations", "restarts")
+"""Names of the integer results of a solve."""
 
 
 @dataclass(frozen=True, eq=False)
-class Example:
-    """The target of the example program.
+class ExampleTarget:
+    """Target of the example program.
 
     Attributes:
-        what: Description in a sentence.
+        description: Description in one sentence.
         points: (f, 3) [m].
         normals: (f, 3), NaN where free.
     """
 
-    what: str
+    description: str
     points: Array
     normals: Array
 
 
-def example(robot: ArmHand) -> Example:
-    """Return the robot's first shipped grasp, or its contacts at home."""
+def example_target(robot: ArmHand) -> ExampleTarget:
+    """Return the first shipped grasp of the robot, or its contacts at home."""
     names = shipped_grasps(robot.name)
     if names:
         grasp = load_grasp(names[0])
         points, normals = grasp.arrays(robot.fingers)
         if not np.isnan(points).any() and not grasp.more(robot.fingers):
-            return Example(f"Solves the shipped grasp {names[0]}.", points, normals)
-    return Example("Solves the contacts of the home configuration.", *robot.contacts(robot.home))
+            return ExampleTarget(f"Solves the shipped grasp {names[0]}.", points, normals)
+    return ExampleTarget(
+        "Solves the contacts of the home configuration.", *robot.contacts(robot.home)
+    )
 
 
-def stored(
-    solver: Solver, scene: SceneTargets | None = None, count: int = COUNT
+def stored_targets(
+    solver: Solver, scene: SceneTargets | None = None, count: int = TARGET_COUNT
 ) -> list[dict[str, Any]]:
-    """Return random targets with the answers of Python.
+    """Return random targets with the solutions of the Python package.
 
     Args:
         solver: Solver of the robot, without a scene.
-        scene: Scene in which the targets are solved; None: collisions are not checked.
+        scene: Scene in which the targets are solved; None: no collision check.
         count: Number of targets.
 
     Returns:
-        Records with the keys q0 (None: the robot is at home and prefers the middle of its limits),
+        Records with the keys q0 (None: start at home and prefer solutions far from limits),
         points, normals, q, status, iterations, restarts; with a scene also clearance.
     """
     robot = solver.robot
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(TARGET_SEED)
     q = robot.random(rng, count)
-    ends = np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper)
-    points, normals = robot.contacts(np.where(rng.random(q.shape) < 0.2, ends, q))
-    beyond = -(-count // UNREACHABLE)
-    points[:beyond] += rng.normal(0, 0.1, points[:beyond].shape)
-    near = np.arange(count) % 4 == 1
+    nearest_limits = np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper)
+    points, normals = robot.contacts(np.where(rng.random(q.shape) < 0.2, nearest_limits, q))
+    n_unreachable = -(-count // UNREACHABLE_PERIOD)
+    points[:n_unreachable] += rng.normal(0, 0.1, points[:n_unreachable].shape)
+    prefers_q0 = np.arange(count) % 4 == 1
     q0 = np.clip(q + 0.1, robot.lower, robot.upper)
-    found: list[dict[str, Any]] = [{} for _ in range(count)]
-    for rows, starts in ((~near, None), (near, q0[near])):
+    targets: list[dict[str, Any]] = [{} for _ in range(count)]
+    for rows, starts in ((~prefers_q0, None), (prefers_q0, q0[prefers_q0])):
         answers = _answers(solver, points[rows], normals[rows], starts)
         for i, row in enumerate(np.flatnonzero(rows).tolist()):
             q, *numbers = next(answers)
-            found[row] = {
+            targets[row] = {
                 "q0": None if starts is None else starts[i].tolist(),
                 "points": points[row].ravel().tolist(),
                 "normals": normals[row].ravel().tolist(),
                 "q": q.tolist(),
-                **dict(zip(WHOLE, map(int, numbers), strict=True)),
+                **dict(zip(INTEGER_RESULTS, map(int, numbers), strict=True)),
             }
-    return found if scene is None else [scene.answered(target) for target in found]
+    return targets if scene is None else [scene.with_scene_result(target) for target in targets]
 
 
 def _answers(
     solver: Solver, points: Array, normals: Array, starts: Array | None
 ) -> Iterator[tuple[Array, int, int, int]]:
-    """Yield the answers to k targets, each with the integers that `WHOLE` names.
+    """Yield q and the `INTEGER_RESULTS` of k targets.
 
-    A batch solves the sides of a robot with several arms and no trunk independently. An export
-    solves them together, as `Solver.fast` does.
+    A batch solves the sides of a multi-arm robot without a trunk independently. An export solves
+    them together, like `Solver.fast`.
     """
     robot = solver.robot.description
     if not robot.sides or robot.trunk:
@@ -133,34 +137,39 @@ def _answers(
 
 
 def targets_header(
-    solver: Solver, scene: SceneTargets | None = None, single: bool = False, count: int = COUNT
+    solver: Solver,
+    scene: SceneTargets | None = None,
+    single: bool = False,
+    count: int = TARGET_COUNT,
 ) -> str:
-    """Return a C header with the `stored` targets and the scene.
+    """Return a C header with the targets of `stored_targets` and the scene.
 
     Args:
         solver: Solver of the robot, without a scene.
-        scene: Scene in which the targets are solved; None: collisions are not checked.
-        single: Whether the header is for a solver in single precision: it then has the status of
-            each answer in double precision, and no configurations.
+        scene: Scene in which the targets are solved; None: no collision check.
+        single: True for a solver in single precision: the header has the status of each solution
+            in double precision, and no configurations.
         count: Number of targets.
     """
     f, n = len(solver.robot.fingers), len(solver.robot.actuators)
-    whole, answer = (WHOLE[:1], "") if single else (WHOLE, f", q[{n}]")
+    integers, answer = (INTEGER_RESULTS[:1], "") if single else (INTEGER_RESULTS, f", q[{n}]")
     clearance = scene is not None and not single
     rows = []
-    for target in stored(solver, scene, count):
+    for target in stored_targets(solver, scene, count):
         q0 = target["q0"] or solver.robot.home.tolist()
-        row = [str(int(target["q0"] is not None)), *(str(target[name]) for name in whole)]
+        row = [str(int(target["q0"] is not None)), *(str(target[name]) for name in integers)]
         row += map(numbers, (target["points"], target["normals"], q0))
         row += [numbers(target["q"])] if answer else []
         if clearance:
             row.append("NAN" if target["clearance"] is None else digits(target["clearance"]))
         rows.append("{" + ", ".join(row) + "},\n")
-    what = "how they end in double precision" if single else "what the Python package answers"
+    content = (
+        "their status in double precision" if single else "the solutions of the Python package"
+    )
     return (
-        f"/* Targets, and {what}. */\n"
+        f"/* Targets, and {content}. */\n"
         f"enum {{ TARGETS = {count} }};\n\n"
-        f"typedef struct {{\n  int near, {', '.join(whole)};\n"
+        f"typedef struct {{\n  int prefers_q0, {', '.join(integers)};\n"
         f"  double points[{3 * f}], normals[{3 * f}], q0[{n}]{answer};\n"
         f"{'  double clearance;' + chr(10) if clearance else ''}}} target;\n\n"
         "static const target targets[TARGETS] = {\n" + "".join(rows) + "};\n"
@@ -168,7 +177,7 @@ def targets_header(
 
 
 FRAMES = 120
-"""Number of frames that the test of an exported follower asks for."""
+"""Number of frames in the test of an exported follower."""
 
 PERIOD = 0.004
 """Time between two frames [s]."""
@@ -178,16 +187,16 @@ FOLLOW_STATUS = ("HOLDING", "FOLLOWING", "LATE", "MISSED")
 
 
 def frames_header(solver: Solver) -> str:
-    """Return C definitions of frames of moving contacts, with the answers of Python's follower.
+    """Return C definitions of frames of moving contacts, with the results of the Python follower.
 
-    The contacts move from those at home towards those of a random configuration, are missing for
-    a few frames, and end out of reach.
+    The contacts move from home towards those of a random configuration, are missing for a few
+    frames, and finally move out of reach.
     """
     robot = solver.robot
     f, n = len(robot.fingers), len(robot.actuators)
-    goal = robot.home + 0.2 * (robot.random(np.random.default_rng(SEED), 1)[0] - robot.home)
-    part = np.linspace(0, 1, FRAMES)[:, None]
-    points, normals = robot.contacts(robot.home + part * (goal - robot.home))
+    goal = robot.home + 0.2 * (robot.random(np.random.default_rng(TARGET_SEED), 1)[0] - robot.home)
+    fractions = np.linspace(0, 1, FRAMES)[:, None]
+    points, normals = robot.contacts(robot.home + fractions * (goal - robot.home))
     points[FRAMES // 2 : FRAMES // 2 + 5] = np.nan
     normals[FRAMES // 2 : FRAMES // 2 + 5] = np.nan
     points[-FRAMES // 6 :] += 3.0
@@ -195,7 +204,7 @@ def frames_header(solver: Solver) -> str:
     rows = []
     for target in zip(points, normals, strict=True):
         q = follower(*target)
-        vectors = [written(vector) for vector in (*target, q)]
+        vectors = [c_array(vector) for vector in (*target, q)]
         status = FOLLOW_STATUS.index(follower.state.status.name)
         rows.append("{" + ", ".join([str(status), *vectors]) + "},\n")
     return (
@@ -205,40 +214,41 @@ def frames_header(solver: Solver) -> str:
     )
 
 
-def written(array: Array) -> str:
+def c_array(array: Array) -> str:
     """Return an array initialiser of C; numbers may be NaN."""
     values = (digits(v) if np.isfinite(v) else "NAN" for v in array.ravel().tolist())
     return "{" + ", ".join(values) + "}"
 
 
-DRAWN = 64
-"""Number of random configurations, at whose fingertips solids are placed."""
+PLACEMENT_SAMPLES = 64
+"""Number of random configurations; solids are placed at fingertips of some of them."""
 
-SIZE = 0.15
+RELATIVE_SIZE = 0.15
 """Size of a solid as a fraction of the robot's reach."""
 
-MARGIN = 1e-3
+SCENE_MARGIN = 1e-3
 """Required clearance [m]."""
 
-GRASPED = 1
+GRASPED_INDEX = 1
 """Index of the grasped solid."""
 
 
 class SceneTargets:
-    """A scene of up to four solids, and the answers to targets in it.
+    """Scene of up to four solids, and the solutions of targets in this scene.
 
     Attributes:
         solver: Solver without a scene.
-        scene: Scene with as many solids as the capacity allows.
+        scene: Scene with as many solids as the capacity permits.
     """
 
     def __init__(self, solver: Solver, capacity: int) -> None:
+        """Place as many of four solids as the capacity permits."""
         self.solver, robot = solver, solver.robot
-        q = robot.random(np.random.default_rng(5), DRAWN)
+        q = robot.random(np.random.default_rng(5), PLACEMENT_SAMPLES)
         tips = robot.contacts(q)[0][:, 0]
-        far = np.linalg.norm(tips, axis=1)
-        places = tips[np.argsort(-far)][[0, 12, 24]]
-        size = SIZE * float(far.max())
+        distances = np.linalg.norm(tips, axis=1)
+        positions = tips[np.argsort(-distances)][[0, 12, 24]]
+        size = RELATIVE_SIZE * float(distances.max())
         wall = [0.9 * float(tips[:, 0].max()), 0.0, 0.0]
         shapes: list[dict[str, Any]] = [
             {"kind": "box", "size": [size, 0.7 * size, 0.5 * size], "rpy": [0.3, 0.2, 0.1]},
@@ -247,18 +257,18 @@ class SceneTargets:
             {"kind": "half-space", "rpy": [0.0, -np.pi / 2, 0.0], "xyz": wall},
         ]
         solids: dict[str, dict[str, Any]] = {}
-        self._check = SceneCheck(robot, Scene({}, MARGIN))
-        for shape, place in zip(shapes, places.tolist(), strict=False):
-            shape["xyz"] = place
-        self.scene = Scene({}, MARGIN)
+        self._check = SceneCheck(robot, Scene({}, SCENE_MARGIN))
+        for shape, position in zip(shapes, positions.tolist(), strict=False):
+            shape["xyz"] = position
+        self.scene = Scene({}, SCENE_MARGIN)
         for shape in shapes[:capacity]:
             solids = solids | {f"solid {len(solids)}": shape}
-            grasped = f"solid {GRASPED}" if GRASPED in range(len(solids)) else None
-            scene = Scene(solids, MARGIN, grasped)
+            grasped = f"solid {GRASPED_INDEX}" if GRASPED_INDEX in range(len(solids)) else None
+            scene = Scene(solids, SCENE_MARGIN, grasped)
             try:
                 self._check = SceneCheck(robot, scene)
             except DescriptionError:
-                # Solids that penetrate the base of a hand alone are left out.
+                # Omit a solid that penetrates the base of a hand without an arm.
                 solids.popitem()
             else:
                 self.scene = scene
@@ -269,23 +279,27 @@ class SceneTargets:
         method = build_method("hand-first", robot.description, {})
         return Engine(robot, method, check=self._check)
 
-    def answered(self, target: dict[str, Any]) -> dict[str, Any]:
-        """Return a stored target with its answer in the scene, as an export searches it."""
+    def with_scene_result(self, target: dict[str, Any]) -> dict[str, Any]:
+        """Return a stored target with its solution in the scene, searched as in an export."""
         if target["status"] != Status.SOLVED:
             return target | {"clearance": None}
         if self.solver.robot.description.sides:
-            return target | self._touching(target)
+            return target | self._collision_result(target)
         points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
-        found = self._free(points, normals, np.array(target["q"]), target["q0"])
-        if found is None and target["q0"] is not None:
-            usual = self.solver.solve_batch(points, normals)
-            found = self._free(points, normals, usual.q[0], None) if usual.success[0] else None
-        if found is None:
+        result = self._collision_free(points, normals, np.array(target["q"]), target["q0"])
+        if result is None and target["q0"] is not None:
+            without_preference = self.solver.solve_batch(points, normals)
+            result = (
+                self._collision_free(points, normals, without_preference.q[0], None)
+                if without_preference.success[0]
+                else None
+            )
+        if result is None:
             return target | {"status": int(Status.COLLISION), "clearance": None}
-        return target | {"q": found[0].tolist(), "clearance": found[1]}
+        return target | {"q": result[0].tolist(), "clearance": result[1]}
 
-    def _touching(self, target: dict[str, Any]) -> dict[str, Any]:
-        """Return whether the answer of a robot with several arms collides; no other is searched."""
+    def _collision_result(self, target: dict[str, Any]) -> dict[str, Any]:
+        """Return status and clearance of the solution of a multi-arm robot, without a search."""
         points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
         request = Request(self.solver.robot, self.solver.tolerances, True)
         query = self._check.collision_query(request.of_arrays(points, normals, None))
@@ -294,10 +308,10 @@ class SceneTargets:
             return {"status": int(Status.COLLISION), "clearance": None}
         return {"clearance": float(clear.distance[0])}
 
-    def _free(
+    def _collision_free(
         self, points: Array, normals: Array, q: Array, q0: list[float] | None
     ) -> tuple[Array, float] | None:
-        """Return a collision-free answer and its clearance [m]; None if the search fails."""
+        """Return a collision-free solution and its clearance [m]; None if the search fails."""
         engine, request = self._engine, Request(self.solver.robot, self.solver.tolerances, True)
         prefer = "limits" if q0 is None else "q0"
         targets = request.of_arrays(points, normals, None, prefer=prefer)
@@ -305,37 +319,38 @@ class SceneTargets:
         assert query is not None
         clear = query.check(q[None])
         if not clear.free[0]:
-            found = resolve_single(
+            resolved = resolve_single(
                 engine.finder, targets, query, q, request.start(q0), try_other_hands=True
             )
-            if found is None:
+            if resolved is None:
                 return None
-            q, _, clear = found
+            q, _, clear = resolved
         return q, float(clear.distance[0])
 
     def solids(self) -> list[dict[str, Any]]:
-        """Return the solids of the scene as arguments of an export."""
-        found = []
+        """Return the solids of the scene as arguments of the exported function."""
+        entries = []
         for name, item in self.scene.items.items():
-            (solid, place) = item.parts[0]
-            found.append(
-                solid_to_dict(solid, item.pose @ place) | {"grasped": name == self.scene.grasped}
+            (solid, pose_in_item) = item.parts[0]
+            entries.append(
+                solid_to_dict(solid, item.pose @ pose_in_item)
+                | {"grasped": name == self.scene.grasped}
             )
-        return found
+        return entries
 
     def header(self, real: str = "double") -> str:
         """Return the scene as C definitions with numbers of the type `real`."""
         rows = ",\n".join(
-            f"{{{one['kind']}, {int(one['grasped'])}, {numbers(one['size'])}, "
-            f"{numbers(one['pose'])}}}"
-            for one in self.solids()
+            f"{{{entry['kind']}, {int(entry['grasped'])}, {numbers(entry['size'])}, "
+            f"{numbers(entry['pose'])}}}"
+            for entry in self.solids()
         )
         return (
             "typedef struct {\n  int kind, grasped;\n"
-            f"  {real} size[3], pose[12];\n}} standing;\n\n"
-            f"enum {{ STANDING = {len(self.scene.items)} }};\n"
+            f"  {real} size[3], pose[12];\n}} standing_solid;\n\n"
+            f"enum {{ N_SOLIDS = {len(self.scene.items)} }};\n"
             f"#define MARGIN ({real}) {digits(self.scene.margin)}\n"
-            f"static const standing scene[STANDING] = {{\n{rows}}};\n\n"
+            f"static const standing_solid scene[N_SOLIDS] = {{\n{rows}}};\n\n"
         )
 
     def json(self) -> str:
@@ -343,42 +358,42 @@ class SceneTargets:
         return json.dumps({"margin": self.scene.margin, "solids": self.solids()}) + "\n"
 
 
-IN_TEST_C = {
+SCENE_TEST_C = {
     "SCENE_TEST_SAME": (
         "      && (!(stored->clearance == stored->clearance)\n"
         "          || solver->clearance == stored->clearance)\n"
     ),
-    # In a collision the answer of largest clearance is not compared.
+    # The result with a collision is not compared: it has the largest clearance found.
     "SCENE_TEST_OR": f"stored->status == {int(Status.COLLISION)} || ",
     "SCENE_TEST_SET": (
-        "  @P_set_margin(&one, MARGIN);\n  @P_set_margin(&other, MARGIN);\n"
-        "  for (i = 0; i < STANDING; ++i) {\n"
-        "    const standing *put = scene + i;\n"
-        "    @P_set_solid(&one, i, put->kind, put->size, put->pose, put->grasped);\n"
-        "    @P_set_solid(&other, i, put->kind, put->size, put->pose, put->grasped);\n"
+        "  @P_set_margin(&whole_solver, MARGIN);\n  @P_set_margin(&sliced_solver, MARGIN);\n"
+        "  for (i = 0; i < N_SOLIDS; ++i) {\n"
+        "    const standing_solid s = scene[i];\n"
+        "    @P_set_solid(&whole_solver, i, s.kind, s.size, s.pose, s.grasped);\n"
+        "    @P_set_solid(&sliced_solver, i, s.kind, s.size, s.pose, s.grasped);\n"
         "  }\n"
     ),
 }
-IN_TEST_SINGLE = IN_TEST_C | {
-    "SCENE_TEST_SAME": "  met &= solver->clearance >= MARGIN;\n",
+SCENE_TEST_SINGLE = SCENE_TEST_C | {
+    "SCENE_TEST_SAME": "  is_within &= solver->clearance >= MARGIN;\n",
 }
-IN_TEST_MJS = {
+SCENE_TEST_MJS = {
     "SCENE_TEST_SAME": (
         "    (target.clearance !== null && target.clearance !== answer.clearance) ||\n"
     ),
     "SCENE_TEST_OR": "target.status !== Status.COLLISION && ",
     "SCENE_TEST_SET": (
-        'const place = new URL("./scene.json", import.meta.url);\n'
-        'const about = JSON.parse(await readFile(place, "utf8"));\n'
-        "for (const one of [solver, other]) {\n"
-        "  one.setMargin(about.margin);\n"
-        "  about.solids.forEach((s, i) => one.setSolid(i, s.kind, s.size, s.pose, s.grasped));\n"
+        'const url = new URL("./scene.json", import.meta.url);\n'
+        'const scene = JSON.parse(await readFile(url, "utf8"));\n'
+        "for (const each of [solver, slicedSolver]) {\n"
+        "  each.setMargin(scene.margin);\n"
+        "  scene.solids.forEach((s, i) => each.setSolid(i, s.kind, s.size, s.pose, s.grasped));\n"
         "}\n"
     ),
 }
 """Substitutes of the marks of tests in a scene."""
 
-OF_BODY_C = {
+MULTI_ARM_TEST_C = {
     "SCENE_TEST_FREED": (
         "  if (stored->status == @G_COLLISION && solver->status == @G_SOLVED) {\n"
         "    return solver->clearance >= MARGIN - 1e-9\n"
@@ -386,12 +401,12 @@ OF_BODY_C = {
         "  }\n"
     ),
 }
-OF_BODY_MJS = {
+MULTI_ARM_TEST_MJS = {
     "SCENE_TEST_FREED": (
         "  if (target.status === Status.COLLISION && answer.status === Status.SOLVED) {\n"
-        "    const near = answer.clearance < about.margin - 1e-9;\n"
-        "    return near || answer.iterations !== target.iterations;\n"
+        "    const isTooClose = answer.clearance < scene.margin - 1e-9;\n"
+        "    return isTooClose || answer.iterations !== target.iterations;\n"
         "  }\n"
     ),
 }
-"""Substitutes for robots with several arms: where the stored answer collides, any is accepted."""
+"""Substitutes for multi-arm robots: any solution is accepted if the stored result collides."""

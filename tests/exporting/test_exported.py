@@ -17,10 +17,10 @@ from processes import output_of
 
 import casadi_ik as ik
 from casadi_ik.compile.codegen import driver_text
-from casadi_ik.export.project import MARK, c_project, checked_prefix, write_folder
-from casadi_ik.export.single import ROUNDING, SinglePrecision, in_single_precision
-from casadi_ik.export.solver import plain
-from casadi_ik.export.targets import SceneTargets, stored
+from casadi_ik.export.project import EXPORT_MARKER, c_project, export_prefix, write_folder
+from casadi_ik.export.single import SINGLE_ROUNDING, SinglePrecision, in_single_precision
+from casadi_ik.export.solver import sanitized_name
+from casadi_ik.export.targets import SceneTargets, stored_targets
 
 STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -199,8 +199,8 @@ def test_exported_arms_avoid_the_scene(robot):
     """Or the comparison of stored answers would say nothing of the choice among arms."""
     solver = ik.Solver(robot)
     targets = SceneTargets(solver, 8)
-    q_before = stored(solver)[:200]
-    after = [targets.answered(target) for target in q_before]
+    q_before = stored_targets(solver)[:200]
+    after = [targets.with_scene_result(target) for target in q_before]
     differs = [b["q"] != a["q"] for b, a in zip(q_before, after, strict=True)]
     assert sum(differs) > 20
     ends = {ik.Status(target["status"]).name for target in after}
@@ -380,11 +380,11 @@ def test_earlier_export_is_replaced_completely(tmp_path):
     out = tmp_path / "solver"
     write_folder(out, {"old.c": "old"})
     write_folder(out, {"src/new.c": "new"})
-    assert sorted(p.name for p in out.rglob("*") if p.is_file()) == [MARK, "new.c"]
+    assert sorted(p.name for p in out.rglob("*") if p.is_file()) == [EXPORT_MARKER, "new.c"]
 
     with pytest.raises(TypeError):
         write_folder(out, {"src/first.c": "first", "src/second.c": None})
-    assert sorted(p.name for p in out.rglob("*") if p.is_file()) == [MARK, "new.c"]
+    assert sorted(p.name for p in out.rglob("*") if p.is_file()) == [EXPORT_MARKER, "new.c"]
     assert [path.name for path in tmp_path.iterdir()] == ["solver"]
 
 
@@ -397,11 +397,11 @@ def test_earlier_export_is_replaced_completely(tmp_path):
     ],
 )
 def test_names_of_robots_become_names_of_c(name, prefix):
-    assert checked_prefix(None, name) == prefix
+    assert export_prefix(None, name) == prefix
 
 
 def test_file_names_do_not_end_comments():
-    assert plain("arm */ #include <x>\n") == "arm __ _include _x__"
+    assert sanitized_name("arm */ #include <x>\n") == "arm __ _include _x__"
 
 
 def test_kernels_compiled_ahead_with_progress(capsys):
@@ -471,8 +471,8 @@ def test_limits_are_rounded_inwards(robot):
     for bounds in (lower, upper):
         assert np.array_equal(bounds, bounds.astype(np.float32))
     insets = np.minimum(lower - robot.lower, robot.upper - upper)
-    assert (insets > 0.5 * ROUNDING).all()
-    assert (insets < 5 * ROUNDING).all()
+    assert (insets > 0.5 * SINGLE_ROUNDING).all()
+    assert (insets < 5 * SINGLE_ROUNDING).all()
 
 
 @needs_gcc

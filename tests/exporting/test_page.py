@@ -19,7 +19,7 @@ from collision_queries import query_of_contacts
 import casadi_ik as ik
 from casadi_ik.collision.clearance_kernel import ClearanceKernel
 from casadi_ik.export import project
-from casadi_ik.export.project import checked_prefix, wasm_project, write_folder
+from casadi_ik.export.project import export_prefix, wasm_project, write_folder
 
 BUILD = Path(__file__).parents[2] / "page" / "build.py"
 ROBOT, BODY = "kuka_lwr_barrett", "two_ur10e+barrett_bh8_280"
@@ -301,7 +301,7 @@ def test_page_works_in_a_browser(
     out, module = tmp_path / "page", tmp_path / "module"
     build(out, module, monkeypatch)
     as_in_python(module / ROBOT)
-    as_in_python(module / checked_prefix(None, BODY))
+    as_in_python(module / export_prefix(None, BODY))
     browser: Browser = request.getfixturevalue("browser")
     url = (out / "index.html").as_uri()
     used_by_mouse(opened(browser, url, 900, 600), robot, browser, url)

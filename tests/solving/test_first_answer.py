@@ -16,7 +16,7 @@ from toy_robots import grasp_of
 
 import casadi_ik as ik
 from casadi_ik.compile.compiler import find_compiler
-from casadi_ik.export.project import uses
+from casadi_ik.export.project import kernel_uses
 
 pytestmark = pytest.mark.skipif(
     find_compiler() is None or os.name != "posix", reason="needs a C compiler, and POSIX's signals"
@@ -116,7 +116,7 @@ def test_nothing_is_compiled_after_preparation(
     def through_all_uses() -> list[str]:
         forget(monkeypatch)
         done = []
-        for use_name, use in uses(ik.load_robot("ar10"), everything=True):
+        for use_name, use in kernel_uses(ik.load_robot("ar10"), everything=True):
             use()
             done.append(use_name)
         return done

@@ -25,8 +25,8 @@ from casadi_ik.export.project import (
     c_project,
     check_folder,
     check_method,
-    checked_prefix,
-    uses,
+    export_prefix,
+    kernel_uses,
     wasm_project,
     write_folder,
 )
@@ -398,7 +398,7 @@ def export(args: Arguments) -> CommandResult:
             "--single: WebAssembly computes as fast in double precision; expected --target c"
         )
     robot = load_robot(args.robot)
-    prefix = checked_prefix(args.prefix, robot.name)
+    prefix = export_prefix(args.prefix, robot.name)
     if args.target == "wasm":
         project_files = wasm_project(robot, prefix, args.scene, args.follow)
     else:
@@ -438,7 +438,7 @@ def compile_ahead(args: Arguments) -> CommandResult:
         )
     lines = []
     for robot in robots:
-        robot_start, graphs = time.perf_counter(), list(uses(robot, args.all))
+        robot_start, graphs = time.perf_counter(), list(kernel_uses(robot, args.all))
         for i, (graph_name, compile_graph) in enumerate(graphs, start=1):
             start = time.perf_counter()
             compile_graph()

@@ -1,14 +1,13 @@
   /**
-   * Where the fingertips are if the hand has a posture and its palm a pose: targets for solve and
-   * others.
+   * Returns the contacts of a hand posture at a palm pose, as a target of solve and begin.
    * @param palm Rotation row by row, then the origin.
-   * @param posture A number for each motor; those of the arm are not looked at.
+   * @param posture One number per motor; those of the arm are ignored.
    */
   touched(
     palm: ArrayLike<number>,
     posture: ArrayLike<number>,
   ): { points: Float64Array; normals: Float64Array };
-  /** As solve, for a palm that is given with the posture of the hand: only the arm is unknown. */
+  /** Solves for the arm at a palm pose with a hand posture. */
   solvePalm(
     palm: ArrayLike<number>,
     posture: ArrayLike<number>,

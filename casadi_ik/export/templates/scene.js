@@ -24,7 +24,7 @@
   }
 
   closest() {
-    if (!Number.isFinite(this._wasm.least())) return null;
+    if (!Number.isFinite(this._wasm.last_clearance())) return null;
     const name = (index) => (index < 0 ? `solid ${-1 - index}` : links[index]);
     return [name(this._wasm.closest(0)), name(this._wasm.closest(1))];
   }

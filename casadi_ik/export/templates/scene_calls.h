@@ -5,13 +5,13 @@
  *
  * A target is solved only if the robot collides neither with a solid nor with itself; self-collision
 @ONE_ARM{@
- * is checked in an empty scene as well. If an answer collides, the solver examines other arm
+ * is checked in an empty scene too. If an answer collides, the solver examines other arm
  * configurations for the same hand pose, and then up to @MAX_HAND_FITS@ other hand poses with theirs, which may
  * take as long as that many solves. If all of them collide, the status is @GUARD@_COLLISION, and q is
  * the answer of largest clearance. */
 @}@
 @BODY{@
- * is checked in an empty scene as well. If an answer collides, the solver examines up to @MAX_TRUNK_TRIALS@
+ * is checked in an empty scene too. If an answer collides, the solver examines up to @MAX_TRUNK_TRIALS@
  * other trunk and arm configurations for the same hand poses, with other arms at each of them, and in
  * between up to @MAX_HAND_FITS@ other hand poses, which may take as long as that many solves. If all of them
  * collide, the status is @GUARD@_COLLISION, and q is the answer of largest clearance. */

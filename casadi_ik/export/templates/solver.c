@@ -1,4 +1,4 @@
-/* The search for a target. */
+/* Search for a solution of a target. */
 #include "@PREFIX@_parts.h"
 
 enum { DONE = 0, SLICE_OVER = 1, GOES_ON = 3 };

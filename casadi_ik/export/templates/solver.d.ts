@@ -1,6 +1,6 @@
-/** Inverse kinematics of @ROBOT@: metres and radians, the robot's base frame. */
+/** Inverse kinematics of @ROBOT@: metres and radians, in the base frame of the robot. */
 
-/** Names, in the order of all arrays. */
+/** Names of fingers and motors, in the order of all arrays. */
 export const fingers: readonly string[];
 export const motors: readonly string[];
 /** Limits and home position of the motors. */
@@ -11,15 +11,15 @@ export const home: readonly number[];
 export const Status: {
   /** The target or q0 is malformed; nothing was solved. */
   readonly BAD_INPUT: -2;
-  /** A number was no longer finite. */
+  /** A number became infinite or NaN. */
   readonly INVALID: -1;
-  /** Not ended yet: call run again. */
+  /** Unfinished: call run again. */
   readonly RUNNING: 0;
-  /** Every contact within tolerance, every motor and joint within its limits. */
+  /** All contacts are within tolerance, all motors and joints within limits. */
   readonly SOLVED: 1;
-  /** Nothing better was found; q is the best. */
+  /** The search found no solution; q is the best configuration. */
   readonly STALLED: 2;
-  /** The budget of iterations is used up. */
+  /** The budget of iterations is exhausted. */
   readonly ITERATION_LIMIT: 3;
 @SCENE_STATUS_DTS?@};
 @FOLLOW_STATUS_DTS?@
@@ -34,26 +34,26 @@ export interface Answer {
 
 export class Solver {
   /**
-   * A solver with memory of its own.
-   * @param source Bytes or a compiled module; without it @PREFIX@.wasm beside this module.
+   * Returns a solver with its memory.
+   * @param source Bytes or a compiled module (default: @PREFIX@.wasm in the folder of this module).
    */
   static load(source?: BufferSource | WebAssembly.Module): Promise<Solver>;
-  /** When contacts count as reached; of one finger, or of all. */
+  /** Sets the tolerances [m, rad] of the contact of a finger (default: of all fingers). */
   setTolerance(position: number, angle: number, finger?: number): void;
-  /** A narrower range of a motor; from = to: it stays there. */
+  /** Narrows the range of a motor; with from = to the motor is fixed. */
   setRange(motor: number, from: number, to: number): void;
   /**
    * Solves one target.
-   * @param points Three numbers a finger; NaN frees it.
-   * @param normals Outward pad normals, of any length; NaN frees one.
-   * @param q0 Where the robot is, and then a solution near it is wanted; without it the robot is at
-   * home, and one far from its limits is wanted.
+   * @param points Three numbers per finger; NaN marks a free finger.
+   * @param normals Outward pad normals, of any length; NaN marks a free normal.
+   * @param q0 Configuration of the robot; solutions near it are preferred. Without it the robot is at
+   * home, and solutions far from its limits are preferred.
    */
   solve(points: ArrayLike<number>, normals: ArrayLike<number>, q0?: ArrayLike<number>): Answer;
-  /** Takes up a target, to be solved by run; returns a Status. */
+  /** Starts the search for a target, which run continues; returns a Status. */
   begin(points: ArrayLike<number>, normals: ArrayLike<number>, q0?: ArrayLike<number>): number;
-  /** Goes on for at most so many iterations. */
+  /** Continues the search for at most this number of iterations. */
   run(iterations: number): Answer;
-  /** Where the fingertips are and which way they face. */
+  /** Returns the contact points and outward normals of the fingertips. */
   contacts(q: ArrayLike<number>): { points: Float64Array; normals: Float64Array };
 @PALM_DTS?@@SCENE_DTS?@@FOLLOW_DTS?@}

@@ -60,7 +60,7 @@ void @PREFIX@_init(@PREFIX@_solver *solver);
 /* Sets the tolerances of the contact of a finger, or of all fingers (finger -1) [m, rad]. */
 void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, @REAL@ position, @REAL@ angle);
 
-/* Narrows the range of a motor; with lower = upper the motor is held there. */
+/* Narrows the range of a motor; with lower = upper the motor is fixed. */
 void @PREFIX@_set_range(@PREFIX@_solver *solver, int motor, @REAL@ lower, @REAL@ upper);
 
 /* Starts the search for a target; returns @GUARD@_RUNNING or @GUARD@_BAD_INPUT.
@@ -73,7 +73,7 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const @REAL@ *points, const @REAL@ *
                    const @REAL@ *q0);
 
 /* Continues the search for at most the given number of iterations and at most one restart; returns
- * the status. The answer does not depend on how the iterations are divided among calls. */
+ * the status. The solution does not depend on the division of iterations among calls. */
 int @PREFIX@_run(@PREFIX@_solver *solver, int64_t iterations);
 
 /* Calls begin, and run until the search is finished; returns the status. */
