@@ -41,14 +41,14 @@ class NearestSettings:
     Attributes:
         seeds: Settings of the seeds.
         race_steps: Number of steps that all starts make.
-        finalists: Number of starts that continue to the minimum.
+        finalists: Number of starts that continue to the minimum, and additional ones per motor.
         tie: Relative difference of two distances below which the configuration nearer to the start
             is chosen.
     """
 
     seeds: SeedSettings = SEED_SETTINGS
-    race_steps: int = 10
-    finalists: int = 16
+    race_steps: int = 12
+    finalists: tuple[int, int] = (12, 1)
     tie: float = 1e-6
 
 
@@ -248,7 +248,9 @@ class NearestSearch:
         start = np.concatenate([q0, last_q, seeds])
         parameters = self._parameters(targets, UNLIMITED_STEP)
         states = self._run(self._states(parameters[owner], start), parameters[owner], is_race=True)
-        finalists = smallest_per_owner(owner, self._distance(states), self._settings.finalists)
+        count, count_per_motor = self._settings.finalists
+        count += count_per_motor * len(self._trials.robot.actuators)
+        finalists = smallest_per_owner(owner, self._distance(states), count)
         owner = owner[finalists]
         states = self._run(states[finalists], parameters[owner])
         q, distance = self._q(states), self._distance(states)

@@ -28,7 +28,7 @@ class SeedSettings:
         regions: Number of regions of the arm's joint space.
         region_samples: Number of arm postures in each region.
         finger_samples: Number of postures of each group of fingers that share motors.
-        seeds: Number of seeds of each target.
+        seeds: Number of seeds of each target, and additional ones per motor.
         candidates: Number of arm postures per seed for which the fingers are chosen.
         chunk_size: Number of targets whose costs are in memory at the same time.
     """
@@ -36,7 +36,7 @@ class SeedSettings:
     regions: int = 128
     region_samples: int = 32
     finger_samples: int = 512
-    seeds: int = 32
+    seeds: tuple[int, int] = (32, 2)
     candidates: int = 2
     chunk_size: int = 32
 
@@ -268,8 +268,9 @@ class SeedTable:
             len(points), settings.region_samples, settings.regions
         )
         lowest = costs.min(axis=1)
-        count = settings.seeds * (settings.candidates if self._has_free_fingers else 1)
-        regions = _smallest(lowest, count)
+        seed_count = settings.seeds[0] + settings.seeds[1] * len(self._robot.actuators)
+        factor = settings.candidates if self._has_free_fingers else 1
+        regions = _smallest(lowest, factor * seed_count)
         target = np.arange(len(points))[:, None]
         sample = costs[target, :, regions].argmin(axis=2)
         arm = sample * settings.regions + regions
@@ -277,7 +278,7 @@ class SeedTable:
         if not self._has_free_fingers:
             return seeds
         total = self._choose_fingers(goals, palms[arm], seeds)
-        return seeds[target, _smallest(total, settings.seeds)]
+        return seeds[target, _smallest(total, seed_count)]
 
     @cached_property
     def _has_free_fingers(self) -> bool:
