@@ -115,6 +115,9 @@ def main(arguments: list[str] | None = None) -> None:
     text = f"""
 # Workspace of the closed chain
 
+**Half of the thumb contacts let the arm follow at least {np.median(share):.0f} % of the palm
+poses.**
+
 `{command(__file__, arguments)}`:
 {args.count} thumb contacts of `{robot.name}` (from configurations uniform within limits), for each
 {args.palms} palms uniform in virtual joint and thumb joints, the arm in closed form within limits;

@@ -306,7 +306,11 @@ def main(arguments: list[str] | None = None) -> None:
     left = len(parts) - len(done)
     heads = ["configurations", "distance [us]", "free? [us]", "coal, any [us]"]
     heads += ["coal, all distances [us]", "MuJoCo [us]", "coal / distance", "coal / free?"]
+    solved, solvable = (
+        sum(int(row[4].split(" of ")[i]) for row in rows) if rows else 0 for i in (0, 1)
+    )
     body = [
+        f"**Of {solvable:,} targets with a known collision-free solution, {solved:,} are solved.**",
         "## Check",
         "Microseconds a configuration, kinematics included; one core of a busy machine, the least "
         f"of {REPEATS} repeats in one process, so the ratios count.",

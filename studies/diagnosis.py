@@ -228,6 +228,8 @@ def main(arguments: list[str] | None = None) -> None:
     if options.count:
         heads = ["targets", "n", "solved", "solved by the diagnosis", "in doubt"]
         rows = false_alarms(robot, options.count, options.bad_starts, options.seed)
+        alarms, count = (sum(int(row[i].replace(",", "")) for row in rows) for i in (-1, 1))
+        parts += [f"**{alarms:,} of {count:,} reachable targets are called unreachable.**"]
         parts += ["## False alarms", FALSE, markdown_table([*heads, "called unreachable"], rows)]
     rows, stored = verdicts(robot, options.impossible, options.seed)
     heads = ["targets", "n", "solved after all", "reasons", "certain %", "diagnosis", "remedies"]

@@ -127,7 +127,20 @@ def main(arguments: list[str] | None = None) -> None:
     heads += ["nearest of solve_all %", "within 10 % of it", "CPU time [us]"]
     tables.append(markdown_table(heads, jumps))
     introduction = INTRODUCTION.format(step=1e3 * options.step)
-    parts = [introduction, f"Seed {options.seed}.", "## Paths", tables[0], "## Anywhere", tables[1]]
+    largest = max(float(row[-1]) for row in steps if row[1] == "q0")
+    result = (
+        f"**With preference q0, no motor moves more than {largest:.2f} deg between contacts "
+        f"{1e3 * options.step:g} mm apart.**"
+    )
+    parts = [
+        result,
+        introduction,
+        f"Seed {options.seed}.",
+        "## Paths",
+        tables[0],
+        "## Anywhere",
+        tables[1],
+    ]
     run_by = command(__file__, arguments)
     publish("Distance to the nearest solution", parts, options.report, run_by)
 

@@ -171,7 +171,12 @@ def main(arguments: list[str] | None = None) -> None:
     causes = sum((Counter(result["why"]) for _, result in done), Counter[str]())
     total = sum(result["grasps"] for _, result in done) // len(POSES)
     text = INTRODUCTION.format(total=total, objects=len(rows), limit=options.limit)
-    parts = [text, markdown_table(heads, rows), "## What is in the way"]
+    free, placed = (sum(int(row[i].split()[0]) for row in rows) for i in (4, 1))
+    result = (
+        f"**{100 * free / max(placed, 1):.0f} % of the published grasps can be used by an arm at a "
+        "table without collision.**"
+    )
+    parts = [result, text, markdown_table(heads, rows), "## What is in the way"]
     parts += [
         markdown_table(
             ["first pair that touches, or status", "published grasps"],

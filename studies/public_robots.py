@@ -116,7 +116,11 @@ def report(
         for outcome in [results[key(row)]["outcome"]]
     ]
     heads = ["repository", "description", "expected structure", "found"]
-    return [text, markdown_table(heads, lines)]
+    result = (
+        f"**{right} of {len(present)} public descriptions are imported without options with the "
+        "expected structure.**"
+    )
+    return [result, text, markdown_table(heads, lines)]
 
 
 def main() -> None:

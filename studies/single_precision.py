@@ -134,7 +134,13 @@ def main(arguments: list[str] | None = None) -> None:
             rows += how_often(name, (double, single), options.count)
     heads = ["robot", "tolerance", "start", "double", "single", "lost", "gained", "false"]
     text = INTRODUCTION.format(count=options.count, away=START_OFFSET)
-    parts, run_by = [text, markdown_table(heads, rows)], command(__file__, arguments)
+    lost, false = (sum(int(row[i].replace(",", "")) for row in rows) for i in (5, 7))
+    result = (
+        f"**Of {options.count * len(rows):,} reachable targets, single precision misses {lost:,} "
+        f"that double precision solves, and {false:,} of its solutions are wrong.**"
+    )
+    parts = [result, text, markdown_table(heads, rows)]
+    run_by = command(__file__, arguments)
     code = {"single_precision": code_version()}
     publish("Exported solver in single precision", parts, options.report, run_by, code)
 

@@ -417,7 +417,11 @@ def main(arguments: list[str] | None = None) -> None:
             rows.append(row_of(robot, results, metrics))
     heads = ["robot", "meshes", "grasps", *CLAIMS, "farthest contact [mm]"]
     sizes = {"meshes": len(options.meshes), "robots": len(options.robots)}
-    parts = [INTRODUCTION.format(limit=options.limit, **sizes), markdown_table(heads, rows)]
+    checks = [check for _, result in done for check in result["violations"]]
+    faulty = sum(any(check[claim] for claim in CLAIMS) for check in checks)
+    result = f"**{faulty or 'None'} of {len(checks):,} grasps violates a checked property.**"
+    introduction = INTRODUCTION.format(limit=options.limit, **sizes)
+    parts = [result, introduction, markdown_table(heads, rows)]
     if len(done) < len(all_cells):
         parts.append(f"Of {len(all_cells):,} meshes before robots {len(done):,} are done so far.")
     parts += ["## Reproduction", f"`{command(__file__, arguments)}`"]

@@ -99,6 +99,9 @@ def main(arguments: list[str] | None = None) -> None:
     text = f"""
 # Range of the virtual joint
 
+**The arm lets half of the configurations turn the virtual joint by at least
+{np.median(width):.0f} deg.**
+
 `{command(__file__, arguments)}`:
 {args.count} arms of `{robot.name}` uniform within limits, the hand at home; the palm is turned
 about the thumb's contact normal in steps of {360 / args.steps:g} deg, the arm follows in closed

@@ -58,6 +58,7 @@ def test_a_small_run_writes_the_report_and_is_resumed(name: str, tmp_path: Path)
     (report,) = [path for path in tmp_path.rglob("*.md") if path.name in ("report.md", "README.md")]
     text = report.read_text()
     assert f"studies/{name}.py" in text, "the command that made it"
+    assert all(line.count(" | ") < 8 for line in text.splitlines()), "at most eight columns"
     pictures = re.findall(r"\(([a-z_]+\.png)\)", text)
     assert all((report.parent / picture).stat().st_size > 1000 for picture in pictures)
     metrics = report.with_name("metrics.json")
