@@ -267,7 +267,7 @@ def solution_report(
 
 
 def reasons(solution: Solution) -> list[str]:
-    """Return why a grasp is not solved, except for the content of the tables."""
+    """Return the reasons why a grasp is not solved, without the content of the tables."""
     target = "the contacts" if solution.palm is None else "the palm"
     lines: list[str] = []
     if solution.collision is not None:
@@ -341,7 +341,7 @@ def _actuator_table(
 
 
 def _limit_excesses(robot: ArmHand, solution: Solution, units: Units) -> dict[str, str]:
-    """Return by how much actuators, and joints coupled to them, exceed their limits."""
+    """Return the excesses of actuators and coupled joints over their limits."""
     description, theta = robot.description, robot.joints(solution.q)
     ranges: dict[str, tuple[float, Any, str]] = {
         joint.name: (theta[joint.name], joint, "m" if joint.type == "prismatic" else "rad")

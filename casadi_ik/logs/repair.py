@@ -338,7 +338,7 @@ class _Merge:
         return *pack_chunk(memoryview(data), runs, compression, position, packed), runs
 
     def _metadata(self) -> dict[str, str]:
-        """Return the metadata of the first shard, and how the other shards differ from it."""
+        """Return the metadata of the first shard, and the differences of other shards from it."""
         base = {key: text for key, text in self.log.shards[0].record.items() if key != SHARDS}
         parts, origins = self.log.solves().parts, []
         for i, source in enumerate(self.log.sources.sources):

@@ -302,7 +302,7 @@ class OriginalShard(msgspec.Struct):
         solves: Ranges (first, last) of the numbers of its solves by method; empty: all solves of
             the file.
         differs: Metadata entries that differ from those of the file.
-        holder: Index of the file that holds its solves now.
+        holder: Index of the file that contains its solves.
         record: Metadata record as text by key.
         metadata: Metadata with structured values parsed.
     """

@@ -8,8 +8,8 @@ within bounds. r and J are the residual of the contacts (`ContactRows`) and its 
 positions are scaled by the unit of each motor. The steps start at the previous goal, so the goal
 stays on its branch.
 
-While motors can keep up with the contacts they are *locked on* the goal: the bounds are those that
-velocities and accelerations permit, and the anchor continues the momentum of the motors. So free
+While motors can follow the contacts they are *locked on* the goal: the bounds follow from the
+limits of velocity and acceleration, and the anchor continues the momentum of the motors. So free
 motions are smooth, and near singular configurations accelerations stay moderate at the price of a
 small error. Errors that remain decay over some cycles (e is the error that the next cycle may
 keep), because bounds would contradict errors that must vanish at once. The anchor moves towards the
@@ -278,7 +278,7 @@ class Cycle:
         first, low, high, *anchor_and_error = begin(state, parameters)
         goal, condition = first, list[ca.MX]()
         if self.obstacles:
-            # A step without clearances takes a fifth less time.
+            # A step without clearances is faster by a fifth.
             step = ca.Function.if_else("choose", self._step(avoids=True), step)
             condition = [ca.mmax(parameters[self.parameters.slice("lacking")]) > 0]
         origin = state[self.state.slice("goal")]
@@ -319,7 +319,7 @@ class Cycle:
         return ca.Function("begin", [state, parameters], outputs)
 
     def _unused_tolerance(self, residual: Expr, p: dict[str, Expr]) -> Expr:
-        """Return the part of the tolerance that a residual does not use; 0 if it exceeds it."""
+        """Return the tolerance minus the residual; 0 if the residual exceeds the tolerance."""
         tolerance = ca.fmin(
             ca.mmin(p["position_tolerance"]) / LENGTH, ca.mmin(p["angle_tolerance"])
         )
@@ -407,12 +407,13 @@ class Cycle:
         squared_residual, clearance_rows = ca.dot(residual, residual), None
         if origin is not None:
             lacking = ca.fmax(p["lacking"], 0.0)
-            # Clearances and contacts balance independently of the period: the squared weight of a
-            # row, times the part of the clearance that a cycle restores, is constant.
-            restored_part = 1 - p["momentum"]
-            weight = CYCLE_TUNING.clearance_weight / LENGTH / ca.sqrt(restored_part)
+            # The balance of clearances and contacts does not depend on the period: the squared
+            # weight of a row, times the fraction of the clearance that a cycle restores, is
+            # constant.
+            restored_fraction = 1 - p["momentum"]
+            weight = CYCLE_TUNING.clearance_weight / LENGTH / ca.sqrt(restored_fraction)
             slopes = -p["slopes"] * ca.repmat(weight * ca.if_else(lacking > 0, 1.0, 0.0), 1, n)
-            restored = weight * restored_part * lacking
+            restored = weight * restored_fraction * lacking
             clearance_rows = slopes @ ca.diag(scales), restored + slopes @ (start - origin)
         residual = residual - error
         pull = ca.sqrt(p["pull"])

@@ -55,7 +55,7 @@ class FollowState:
 
     Attributes:
         status: Result of the cycle.
-        reason: Why the frame was invalid, "" if it was valid.
+        reason: Reason why the frame was invalid, "" if it was valid.
         q: (n,) commanded positions of the motors at the end of the cycle [rad or m].
         velocity: (n,) velocities of the motors in the cycle [rad/s or m/s].
         position_error: (f,) position errors of the fingertips at q [m], NaN where free.
@@ -179,11 +179,10 @@ class Follower:
         self._recovery.reset(clipped)
 
     def branch(self, q: ArrayLike) -> None:
-        """Change the branch: each motor moves to a configuration, and the robot follows there.
+        """Move to a configuration, usually on another branch, and continue to follow from there.
 
-        Free motions lead to this configuration from now on. It should be a solution of the present
-        contacts (`Solver.solve`, `Solver.solve_all`): otherwise the goal leaves it for the contacts
-        at once.
+        The configuration also becomes the posture of free motions. It should be a solution of the
+        present contacts (`Solver.solve`, `Solver.solve_all`): otherwise the goal departs from it.
 
         Args:
             q: (n,) positions of the motors [rad or m]; clipped to the limits.

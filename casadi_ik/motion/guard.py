@@ -139,11 +139,11 @@ class Guard:
         return np.clip(q + motion, *self._bounds)
 
     def step(self, inputs: FollowerInputs, step: Array | None = None) -> tuple[Array, bool]:
-        """Make a step, or the part of it after which the motors can still stop in time.
+        """Make a step, or the fraction of it after which the motors can still stop in time.
 
         Args:
             inputs: Graph of the cycle and its memory.
-            step: (n,) step of the motors; None uses that of the graph.
+            step: (n,) step of the motors; None: the step of the graph.
 
         Returns:
             The new state, and True if motors had to brake.
@@ -156,39 +156,40 @@ class Guard:
             new_state = run.step()
         else:
             new_state = inputs.step_by(step)
-        q, wanted_step = state[:n], new_state[n : 2 * n]
-        share, step, q_rest = self._free_step(q, state[n : 2 * n], wanted_step)
-        is_stopped = share < 1.0
+        q, requested_step = state[:n], new_state[n : 2 * n]
+        fraction, step, q_rest = self._free_step(q, state[n : 2 * n], requested_step)
+        is_stopped = fraction < 1.0
         if not is_stopped.any():
             return new_state, False
         # Rounding errors of a motor that stops at a limit must not exceed it.
         new_state[:n], new_state[n : 2 * n] = np.clip(q + step, *self._bounds), step
-        # A goal beyond an obstacle would be reached through it.
+        # Without this reset, the goal of a stopped motor could lie behind an obstacle.
         np.copyto(new_state[2 * n : 3 * n], q_rest, where=is_stopped)
         new_state[3 * n] = 0.0
         return new_state, True
 
     def _free_step(
-        self, q: Array, last_step: Array, wanted_step: Array
+        self, q: Array, last_step: Array, requested_step: Array
     ) -> tuple[Array, Array, Array]:
-        """Return the part of a wanted step that is free and can end free.
+        """Return the fraction of a requested step that is collision-free including braking.
 
-        Motors that move a pair below its required distance, or nearer than it is if that is less,
-        make a smaller part of their steps, and brake finally: braking of all motors of a pair was
-        checked in the cycle before.
+        If motors move a pair below its required distance (or below its present distance if that is
+        smaller), their fraction is reduced, finally to braking: braking of all motors of a pair was
+        checked in the previous cycle.
 
         Returns:
-            (n,) share of the wanted step by motor, (n,) the step, (n,) positions at rest after it.
+            (n,) fraction of the requested step by motor, (n,) the step, (n,) positions at rest
+            after it.
         """
         if (guarding := self._compiled) is not None:
             guarding.q[...], guarding.last_step[...] = q, last_step
-            guarding.wanted_step[...] = wanted_step
+            guarding.wanted_step[...] = requested_step
             guarding.stop_in_time()
             return guarding.share, guarding.step, guarding.q_rest
         braked = np.sign(last_step) * np.maximum(np.abs(last_step) - self._change, 0.0)
         fractions, attempts = np.array([*self.fractions, 0.0]), np.zeros(self._n, dtype=int)
         while True:
-            step = braked + fractions[attempts] * (wanted_step - braked)
+            step = braked + fractions[attempts] * (requested_step - braked)
             path = stopping_path(q, step, self._change)
             initial, *distances = self._query.kernel.all_distances(
                 np.concatenate([q[None], path]), self._query.poses, self._query.table
@@ -201,9 +202,9 @@ class Guard:
             attempts += is_reduced
 
     def _blocking_motors(self, moves_pair: Bools) -> Bools:
-        """Return the motors (n,) that pairs stop, given which motors (p, n) move them.
+        """Return (n,) True for motors to stop, from the motors (p, n) that move each pair.
 
-        `mark_blocking_motors` of guard.c does the same.
+        `mark_blocking_motors` in guard.c is the compiled version.
         """
         arms = (moves_pair & (self._hand == 0)).any(axis=0)
         sides = np.isin(self._side, self._side[arms]) | (self._side[arms] < 0).any()

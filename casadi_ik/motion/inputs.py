@@ -38,7 +38,7 @@ class FollowPlan:
         period: Time from cycle to cycle [s].
         rates: Limits of velocities and accelerations.
         posture: (n,) posture to which free motions lead [rad or m].
-        settling: Time constant of free motions [s]; infinite: they stay where they are.
+        settling: Time constant of free motions [s]; infinite: no free motion.
         pull: Weight of the anchor, see `Cycle`.
     """
 
@@ -62,7 +62,7 @@ class FollowPlan:
     def cycle_parameters(self) -> dict[str, float]:
         """Decay of free motions and of errors from cycle to cycle, as parameters of a cycle.
 
-        Free motions are those of a critically damped spring between the motors and their posture.
+        Free motions are the response of a critically damped spring between motors and posture.
         """
         if math.isinf(self.settling):
             return {"pull": self.pull, "momentum": 0.0, "spring": 0.0, "error_decay": 0.0}
@@ -266,7 +266,7 @@ class FollowerInputs:
         self._fill(posture=posture)
 
     def clear_target(self) -> None:
-        """Remove contacts and palm poses, so that the goal stays where it is."""
+        """Remove contacts and palm poses, so that the goal does not move."""
         self._mode = ""
         self._fill(points=0.0, normals=UNUSED_NORMAL, weights=0.0)
         self.clear_palms()
@@ -305,7 +305,7 @@ def contact_rows(cycle: Cycle, targets: TargetBatch) -> dict[str, Array]:
 
 
 def invalid_frame_reason(points: Array, normals: Array) -> str:
-    """Return why a frame of a stream is invalid, "" if it is valid.
+    """Return the reason why a frame of a stream is invalid, "" if it is valid.
 
     Args:
         points: (f, 3), all NaN where a finger is free.

@@ -157,10 +157,11 @@ class TimingTuning:
     """Parameters of the time parametrisation of a path.
 
     Attributes:
-        min_segment: Postures nearer to the next than this part of the path length are omitted.
+        min_segment: Minimum distance between consecutive postures, relative to the path length;
+            closer postures are omitted.
         grid: Minimum number of grid points at which the speed is computed.
-        limit_share: Share of the limits that is used at the grid points, because the speed is
-            higher between them.
+        limit_share: Fraction of the limits at the grid points, because the speed is higher between
+            them.
         last_grid_offset: Distance of an additional grid point before each posture, relative to the
             grid interval.
     """

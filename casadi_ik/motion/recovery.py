@@ -161,7 +161,7 @@ class Recovery:
     def _extend_trail(self, q: Array) -> None:
         """Add a posture to the trail if it is far enough from the last one.
 
-        A trail that comes back to itself is cut off there.
+        If the posture revisits the trail, the trail is cut at the revisited posture.
         """
         distances = self._distances(q)
         distance = float(distances[-1])

@@ -85,17 +85,17 @@ class Retarget(Struct, frozen=True, kw_only=True):
         fingers: Keypoint by finger of the robot; other fingers are free.
         sides: Configuration by side of a multi-arm robot, in place of `fingers`.
         wrist: Keypoint of the wrist.
-        scaling: Size of the robot's hand relative to the person's; 0: the ratio of their reaches
-            when open, from the robot's fingertips and the person's bones.
+        scaling: Size of the robot's hand relative to the person's; 0: the ratio of the reaches of
+            the open hands, from the robot's fingertips and the person's bones.
         travel: Motion of the robot's wrist relative to the person's; default: 1, or 0 if the origin
             of the keypoints is in the hand (MediaPipe's world landmarks).
         mirror: True if the hands differ: a person's left hand moves a right robot hand.
-        rpy: Orientation of the keypoints' frame in the robot's base frame [rad]; default: the one
-            that aligns the fingertips of the first frame with the robot's.
+        rpy: Orientation of the keypoints' frame in the robot's base frame [rad]; default: the
+            fingertips of the first frame are aligned with the robot's.
         xyz: Position of the robot's wrist at the person's first position [m]; default: the present
             position.
-        low_pass: Weight of a new frame in the smoothed one at 30 frames per second, for any rate of
-            calls; 1 does not smooth.
+        low_pass: Weight of a new frame in the low-pass filter at 30 frames per second,
+            independently of the rate of calls; 1: no filter.
         wrist_weight: Weight of the wrist's pose relative to a fingertip.
         robot: Name of the robot; an option of the command line takes precedence.
     """
@@ -139,7 +139,7 @@ def load_retarget(path: str | Path) -> Retarget:
 
 
 def _invalid_reason(config: Retarget) -> str:
-    """Return why a configuration is invalid, "" if it is valid."""
+    """Return the reason why a configuration is invalid, "" if it is valid."""
     if config.sides:
         for name, value in (("fingers", config.fingers), ("xyz", config.xyz)):
             if value:
@@ -203,7 +203,8 @@ class RetargetGoal:
         points: (f, 3) fingertip positions [m], base frame; NaN where free or the frame is invalid.
         palm: (4, 4) pose of the palm, or poses by side of a multi-arm robot without those of
             invalid frames; None if the frame is invalid.
-        reason: Why a frame was rejected, with its side if there are two; "" if none was.
+        reason: Reason why a frame was rejected, with its side if there are two; "" if no frame
+            was rejected.
     """
 
     points: Array

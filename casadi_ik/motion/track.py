@@ -127,11 +127,11 @@ class Jump:
         index: Number of the grasp.
         actuator: Motor with the largest motion relative to its range.
         size: Motion of this motor [rad or m].
-        at_limit: Motors at a limit where the continuous motion ends; empty if it ends for another
-            reason, such as a singular arm.
+        at_limit: Motors at a limit at the end of the continuous motion; empty if it ends for
+            another reason, such as a singular arm.
 
     Example:
-        >>> away = np.diag([-1.0, -1.0, 1.0, 1.0])  # the other side of the robot, at once
+        >>> away = np.diag([-1.0, -1.0, 1.0, 1.0])  # rotated to the other side of the robot
         >>> jump = solver.track([grasp, grasp.at(away)]).jumps[0]
         >>> jump.index, jump.actuator in robot.actuators
         (1, True)
@@ -164,7 +164,7 @@ class Path:
 
     @property
     def unreachable(self) -> int:
-        """Number of grasps that were missed so far and have no solution."""
+        """Number of missed grasps without a solution."""
         return sum(not reachable for reachable in self._reachable.values())
 
     def follow(self, start: Array) -> tuple[Array, list[Jump]]:
@@ -253,7 +253,7 @@ class Path:
         return goals[-1], goals[leaps[0]] if len(leaps) else None
 
     def starts(self, q0: Array, prefer: str) -> Iterator[Array]:
-        """Yield solutions of the first grasp, first that of a solve, which is fast."""
+        """Yield solutions of the first grasp, beginning with the result of a fast solve."""
         engine, row, first = self.engine, np.zeros(1, dtype=np.intp), self._row(0)
         run = engine.method.run(replace(first, prefer=prefer), q0[None], self.seed, trace=False)
         is_solved = bool(self.meets(row, run.q)[0])
@@ -348,8 +348,8 @@ def track(
 ) -> Track:
     """Track k grasps with the same kinds of contacts.
 
-    The motion begins at the best solution of the first grasp from which all others are reached
-    without a jump; or else at the one with the fewest misses and then the fewest jumps.
+    The motion begins at the best solution of the first grasp from which all grasps are reached
+    without a jump, otherwise at the solution with the fewest misses, then the fewest jumps.
 
     Args:
         engine: Engine of the hand-first method for the kinds of contacts.

@@ -1,8 +1,8 @@
 """Search for an object pose within bounds at which the robot can reach the grasp.
 
-The whole range of poses is proved impossible by bisection: a contact moves within a box of poses by
-at most the radius of the box, so that a proof for the pose at the center of the box, with
-tolerances that are wider by this radius, holds for all of its poses.
+The proof that no pose is possible bisects the range: within a box of poses a contact moves by at
+most the radius of the box, so a proof for the central pose with tolerances that are wider by this
+radius is valid for all poses of the box.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def place_targets(targets: TargetBatch, poses: Array) -> TargetBatch:
 
 
 def is_unreachable_throughout(prove: Prove, targets: TargetBatch, free: Free) -> bool:
-    """Return True if it is proved that no object pose within the bounds can be reached.
+    """Return True if a proof shows that no object pose within the bounds can be reached.
 
     Args:
         prove: Search for proofs.
@@ -92,7 +92,6 @@ def is_unreachable_throughout(prove: Prove, targets: TargetBatch, free: Free) ->
         count += len(lower)
         if count > effort.max_pose_boxes:
             return False
-        # All boxes of a pass have the same widths.
         half_widths = (upper[0] - lower[0]) / 2
         rotation = float(half_widths[3:].sum())
         chord = 2 * np.sin(min(rotation, np.pi) / 2)
@@ -123,7 +122,7 @@ def solve_with_object(
     start: Array,
     ranges: Array,
 ) -> Solution:
-    """Solve a grasp at the preferred object pose of those that are tried.
+    """Solve a grasp at the preferred object pose among several attempts.
 
     Args:
         solve: Solves targets; the flag enables the diagnosis.
@@ -135,9 +134,9 @@ def solve_with_object(
         ranges: (n,) ranges of the motors.
 
     Returns:
-        Of the solved poses the one nearest to `start` if that is preferred, else the one nearest
-        to the center of the bounds; if none is solved, the central pose with its diagnosis, which
-        is `Status.UNREACHABLE` only if that is proved for all poses within the bounds.
+        The solved pose nearest to `start` if the preference is "q0", else the solved pose nearest
+        to the center of the bounds. Without a solution: the central pose with its diagnosis, which
+        is `Status.UNREACHABLE` only if a proof covers all poses within the bounds.
     """
     poses, first = poses_within(free, sum(POSE_BATCHES)), 0
     span = np.maximum(np.asarray(free.upper) - np.asarray(free.lower), 1e-12)

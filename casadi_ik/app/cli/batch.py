@@ -144,7 +144,7 @@ def batch(args: Arguments) -> CommandResult:
         "prefer": args.prefer,
         "best_effort": bool(args.best_effort),
     }
-    totals, faults = Totals(), _Faults(path)
+    totals, faults = Totals(), _MalformedTargets(path)
     solver = (_solve_parts if in_parts else _solve_blocks)(
         args, path, robot, settings, totals, faults
     )
@@ -155,21 +155,21 @@ def batch(args: Arguments) -> CommandResult:
     return CommandResult.of_parts(totals.solved == totals.count, report, *written)
 
 
-class _Faults:
-    """Count of malformed targets, and the messages of the first ones."""
+class _MalformedTargets:
+    """Number of malformed targets, and the first messages."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._count, self._messages = path, 0, {}
 
-    def add_faults(self, faults: Mapping[int, str]) -> None:
-        """Record malformed targets, given as messages by row number."""
-        self._count += len(faults)
-        self._messages = dict(sorted({**self._messages, **faults}.items())[:ROWS_SHOWN])
+    def add_messages(self, messages: Mapping[int, str]) -> None:
+        """Record the messages of malformed targets by row number."""
+        self._count += len(messages)
+        self._messages = dict(sorted({**self._messages, **messages}.items())[:ROWS_SHOWN])
 
     def report(self, count: int) -> None:
         """Print the malformed targets out of `count` targets on stderr."""
-        for fault in self._messages.values():
-            print_message("bad row", f"{self._path}: {fault}")
+        for message in self._messages.values():
+            print_message("bad row", f"{self._path}: {message}")
         if self._count:
             print_message(
                 "bad rows", f"{self._path}: {self._count} of {count}; their status is INVALID"
@@ -182,7 +182,7 @@ def _solve_blocks(
     robot: ArmHand,
     settings: Mapping[str, Any],
     totals: Totals,
-    faults: _Faults,
+    faults: _MalformedTargets,
 ) -> Solver:
     """Solve an npz file in this process.
 
@@ -193,7 +193,7 @@ def _solve_blocks(
     targets = TargetFile(path, len(robot.fingers))
     count = targets.check(MAX_BLOCK)
     check_outputs({"--log": args.log, "--out": args.out}, inputs=[path])
-    pose, solver, pace = parse_object_pose(args), make_solver(args, robot), _Pace(args.jobs)
+    pose, solver, pace = parse_object_pose(args), make_solver(args, robot), _BlockSize(args.jobs)
     target_blocks = targets.blocks(pace.start_block)
     if pose is not None:
         target_blocks = (transform_arrays(block, pose) for block in target_blocks)
@@ -205,7 +205,7 @@ def _solve_blocks(
                 arrays = columns(block.solution)
                 output_file.append(arrays)
                 totals.add(arrays, block.first_row)
-                faults.add_faults(block.faults)
+                faults.add_messages(block.faults)
                 show(len(block.solution))
                 pace.finish_block()
         except KeyboardInterrupt:
@@ -217,10 +217,10 @@ def _solve_blocks(
     return solver
 
 
-class _Pace:
+class _BlockSize:
     """Controller of the block size, so that a block takes 1 to 4 s.
 
-    This is the work that Ctrl-C can lose. The first block has one target per job.
+    Ctrl-C can lose the work of one block. The first block has one target per job.
     """
 
     def __init__(self, jobs: int) -> None:
@@ -247,7 +247,7 @@ def _solve_parts(
     robot: ArmHand,
     settings: Mapping[str, Any],
     totals: Totals,
-    faults: _Faults,
+    faults: _MalformedTargets,
 ) -> Solver:
     """Solve targets in parts.
 
@@ -275,7 +275,7 @@ def _solve_parts(
     with show_progress as show, writing(folder.path, "--out"):
         try:
             for part in solve_parts(solver, source, settings, folder, args.jobs, args.dask, pose):
-                faults.add_faults(part.faults)
+                faults.add_messages(part.faults)
                 show(part.count)
         except KeyboardInterrupt:
             if done := folder.done():
@@ -307,7 +307,7 @@ def _part_solutions(folder: BatchFolder, source: TargetSource, number: int) -> d
 def _batch_settings(
     args: Arguments, solver: Solver, source: TargetSource, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return all inputs that determine the solutions, to refuse parts of other batches."""
+    """Return the inputs that determine the solutions, which identify the parts of a batch."""
     scene = None
     if args.scene is not None:
         file = resolve_description(args.scene, "scenes")
@@ -329,7 +329,7 @@ class _GrowingFile:
     """Output file whose arrays are appended to on disk; created by `_growing_file`.
 
     Attributes:
-        count: Number of rows of every array so far.
+        count: Number of rows of every array.
     """
 
     def __init__(self, path: Path, folder: Path, robot: ArmHand) -> None:
@@ -338,7 +338,7 @@ class _GrowingFile:
         self._streams: dict[str, tuple[IO[bytes], np.ndarray]] = {}
 
     def append(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Append rows to the arrays; every call passes the same names.
+        """Append rows to the arrays; all calls have the same names.
 
         Raises:
             OutputError: The rows cannot be written.

@@ -61,15 +61,15 @@ def load_grasp_arg(args: Arguments) -> tuple[Path, Grasp]:
 def load_robot_arg(
     name: str | None, path: Path | None = None, grasp: Grasp | None = None
 ) -> ArmHand:
-    """Return the robot of ``--robot``, or else the one that the grasp file names.
+    """Return the robot of ``--robot``, or the robot that the grasp file names.
 
     Args:
         name: Value of ``--robot``, or None.
-        path: File of the grasp; a robot file that it names is relative to it.
+        path: File of the grasp, to which the path of a robot file is relative.
         grasp: Grasp.
 
     Raises:
-        InputError: Neither names a robot.
+        InputError: Neither the option nor the grasp names a robot.
         UnknownNameError: No shipped robot has this name.
         DescriptionError: The file of the robot is missing or malformed.
     """

@@ -164,7 +164,7 @@ class Command:
 
 
 def command(*options: Option) -> Callable[[Callable[[Arguments], CommandResult]], Command]:
-    """Return a decorator that makes a command of a function of its arguments."""
+    """Return a decorator that converts a function of arguments to a command."""
     unit_options = UNIT_OPTIONS if any(option.unit for option in options) else ()
     return lambda run: Command(run, options + unit_options)
 

@@ -213,8 +213,9 @@ def _load_solves(args: Arguments) -> list[tuple[SolveRecord, ArmHand]]:
 
     Raises:
         LogError: A log is missing or damaged, or was written for another robot.
-        UnknownNameError: The log has no such solve, or several and no number is given.
-        InputError: More solve numbers than logs are given.
+        UnknownNameError: The log does not have this solve, or has several and the number is
+            missing.
+        InputError: There are more solve numbers than logs.
     """
     numbers = args.solve or []
     if len(numbers) > len(args.what):

@@ -91,7 +91,7 @@ def close_view(robot: ArmHand, q: ArrayLike, *sides: str | None) -> View:
 def overview(target: Array, close_up: View) -> View:
     """Return a view from the side of an arm that reaches for a target.
 
-    Of the two sides, the one nearer to the azimuth of the close-up is chosen.
+    The side closer to the azimuth of the close-up is chosen.
 
     Args:
         target: (3,) Position of the target in the base frame [m].
@@ -147,8 +147,8 @@ class Drawable:
 def visual_bodies(robot: ArmHand) -> list[Drawable]:
     """Return the visual geometry of a robot in the frames of its links, with a pad per fingertip.
 
-    Arms and hands have the meshes of the robot's files, otherwise the collision shapes. A link with
-    neither is drawn as rods to its child joints.
+    Links are drawn as the meshes of the robot's files, otherwise as collision shapes, otherwise as
+    rods to their child joints.
 
     Args:
         robot: The robot.
@@ -226,7 +226,7 @@ def merge_by_frame(drawables: Sequence[Drawable]) -> list[Drawable]:
 
 
 def link_styles(description: RobotDescription) -> dict[str, tuple[str, str]]:
-    """Return by link its role ("arm" or "hand") and a colour unlike that of its parent."""
+    """Return the role of each link ("arm" or "hand"), and a colour unlike that of its parent."""
     palms = {description.palm_link, *(side.palm_link for side in description.sides)}
     is_hand_alone = not (description.arm_actuators or description.sides)
     depth, roles = {description.root: 0}, {description.root: "hand" if is_hand_alone else "arm"}
@@ -434,8 +434,8 @@ def clearance_marks(closest: ClosestPoints, show_shapes: bool = False) -> list[D
 
     Args:
         closest: The pair of shapes.
-        show_shapes: Return the bounded ones of the two shapes instead, enlarged by a millimetre so
-            that they are visible.
+        show_shapes: True to return the bounded shapes of the pair instead, enlarged by a millimetre
+            for visibility.
     """
     start, end = closest.ends
     shapes = [rod(start, end, 0.0012), ball(0.0022, start), ball(0.0022, end)]

@@ -1,4 +1,4 @@
-"""Colours of pictures and pages; each kind of thing has the same colour everywhere."""
+"""Colours of pictures and pages, by what they mark."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ PHASE_COLORS = ("#f3f1ec", "#fbecd9", "#deebf7", "#e3f2e1")
 
 
 def method_colors(methods: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each method: its fixed one, or one that no other method uses."""
+    """Return a colour for each method: its fixed colour, or a colour that no other method uses."""
     unused = iter([color for color in LINE_COLORS[::-1] if color not in METHOD_COLORS.values()] * 9)
     return {
         name: METHOD_COLORS[name] if name in METHOD_COLORS else next(unused) for name in methods

@@ -208,7 +208,7 @@ def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None =
 
 
 def _start_page(server: Server, page: Callable[[Server], Page]) -> Viewer:
-    """Start a page; stop its server if the page cannot be made."""
+    """Start a page, and stop its server if the page raises an error."""
     try:
         return Viewer(server, page(server))
     except BaseException:

@@ -48,7 +48,7 @@ HOST = "127.0.0.1"
 """Default host: only this machine can open a page."""
 
 PORT = 8080
-"""First port that is tried."""
+"""First port to try."""
 
 
 Handler = Callable[[ServerConnection], Awaitable[None]]
@@ -75,7 +75,7 @@ class Access:
     title: str = "casadi_ik"
 
     def refusal(self, request: Request) -> str:
-        """Return why a request is refused; "" if it is allowed."""
+        """Return the reason why a request is refused; "" if it is allowed."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_valid_host(hosts[0]):
             return "Host: expected the address of this machine"
@@ -237,7 +237,7 @@ class Server(viser.ViserServer):
 
 
 class Viewer:
-    """A running page; all browsers that open it see and move the same robot.
+    """Running page; all browsers that open it display and move the same robot.
 
     Attributes:
         url: Address of the page.

@@ -128,8 +128,8 @@ class CandidateList:
         """Change the filter.
 
         Args:
-            bounds: Lower bounds of `load` [N/N] and `clearance` [m], and `max_count`; omitted ones
-                are unchanged.
+            bounds: Lower bounds of `load` [N/N] and `clearance` [m], and `max_count`; omitted
+                bounds are unchanged.
         """
         self._bounds |= bounds
         names = self.shown_names

@@ -237,11 +237,12 @@ MAX_WARNINGS = 20
 
 
 class LatestOnly:
-    """A worker thread that applies the latest change of every key, refreshes, and runs idle tasks.
+    """Worker thread that applies the latest change of each key, refreshes, and runs idle tasks.
 
-    A drag sends twenty changes a second, however long a solve takes. Each change has a key; a
-    pending change is dropped when another one with its key arrives. Idle tasks start after a time
-    without changes, and are cancelled by a new change. Threads of the server only submit changes.
+    A drag sends twenty changes a second, independently of the time of a solve. Each change has a
+    key; a pending change is dropped when another change with its key arrives. Idle tasks start
+    after a time without changes, and are cancelled by a new change. Threads of the server only
+    submit changes.
     """
 
     def __init__(self, refresh: Task, idle_tasks: tuple[tuple[float, Task], ...] = ()) -> None:
@@ -250,7 +251,7 @@ class LatestOnly:
         Args:
             refresh: Function called once after all pending changes.
             idle_tasks: Pairs of a time without changes [s], in ascending order, and the task that
-                then starts. All of them are repeated after the next change.
+                then starts. The tasks are repeated after the next change.
         """
         self._refresh, self._idle_tasks = refresh, idle_tasks
         self._changes: dict[str, Task] = {}
@@ -264,7 +265,7 @@ class LatestOnly:
         self._thread.start()
 
     def submit(self, key: str, change: Task) -> None:
-        """Submit a change; returns at once."""
+        """Submit a change without waiting for it."""
         with self._condition:
             if self._changes.pop(key, None) is not None:
                 self.dropped_count += 1

@@ -78,7 +78,7 @@ def legend(entries: Iterable[tuple[str, str]]) -> str:
 
 
 def verdict_block(result: SolveResult) -> str:
-    """Return headline and sentence of a result, always of the same height."""
+    """Return headline and sentence of a result in a block of constant height."""
     color = palette.MET if result.success else palette.MISSED
     scale, unit = next(
         candidate

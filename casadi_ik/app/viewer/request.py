@@ -318,8 +318,8 @@ class RequestSolver:
     def explain(self, request: PageRequest, q: Array) -> SolveResult:
         """Return the result with the reasons for a failure and possible remedies.
 
-        The configuration shown is kept unless the diagnosis finds a nearer one, so that the arm
-        does not switch between equally near configurations when the mouse rests.
+        The displayed configuration changes only if the diagnosis finds a nearer configuration, so
+        that the arm does not switch between equivalent configurations while the mouse rests.
 
         Raises:
             CasadiIKError: The request is malformed.

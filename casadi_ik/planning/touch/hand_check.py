@@ -72,7 +72,7 @@ class HandCheck:
         """Return the minimum distances (c,) between capsule axes of the hand and solids [m].
 
         Args:
-            of_object: True for distances from the object, False from the rest of the scene.
+            of_object: True for distances from the object, False for distances from the scene.
         """
         pairs, shapes = self._all_pairs, self.shapes
         first = len(pairs.radii) + pairs.own

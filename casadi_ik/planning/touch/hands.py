@@ -21,10 +21,11 @@ class TouchParameters:
         pairs_per_draw: Number of pairs of patches drawn at once.
         first_batch: Candidates generated in the first batch.
         max_batch: Maximum number of candidates generated in one batch.
-        max_attempts_per_batch: Maximum number of pairs of hand and object tried for one batch.
-        max_attempts: Maximum number of pairs of hand and object tried in all.
+        max_attempts_per_batch: Maximum number of attempts for one batch; an attempt is a pair of
+            fingertips matched with a pair of patches.
+        max_attempts: Maximum number of attempts in total.
         max_consecutive_duplicates: Stop generating after this many duplicates in a row.
-        max_unreachable_hands: Give up if the arm has reached none of this many hand poses.
+        max_unreachable_hands: Give up after this many hand poses if the arm reached none.
         min_trial_probability: Minimum probability of trying a palm depth or direction, relative to
             the one that was most often free of collision.
         max_pinch_depth: Saturation of the depth score: distance of the pinch midpoint from the
@@ -147,8 +148,8 @@ class HandCandidates(RecordReprMixin):
     def duplicates(self, reference: HandCandidates, parameters: TouchParameters) -> Bools:
         """Return (k, n) True where a candidate is close to one of n reference candidates.
 
-        Close means: the same fingers touch, and palm and fingertips are within the minimum
-        separation and rotation of distinct grasps.
+        Candidates are close if their touching fingers are equal, and palm and fingertips differ by
+        less than the minimum separation and rotation of distinct grasps.
         """
         rotations, reference_rotations = (
             hands.palm[:, :3, :3].reshape(-1, 9) for hands in (self, reference)
