@@ -1,4 +1,4 @@
-"""Colours of pictures and pages, by what they mark."""
+"""Colours of pictures and pages, by the meaning of the drawn item."""
 
 from __future__ import annotations
 
