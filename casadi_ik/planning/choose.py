@@ -352,7 +352,7 @@ class _Search:
                 last = min(first + CHOOSE_PARAMETERS.chunk_size, len(selected))
                 rows = np.arange(first, last)
                 chunk_query = None if query is None else query.rows(rows)
-                chunk = _Chunk(self, engine.finder, group.rows(rows), chunk_query)
+                chunk = _CandidateChunk(self, engine.finder, group.rows(rows), chunk_query)
                 yield selected[rows], chunk.solve(thorough)
 
     def best(
@@ -408,7 +408,7 @@ class _Search:
         return verified
 
 
-class _Chunk:
+class _CandidateChunk:
     """Candidates with equal fingers and contact kinds that are solved together."""
 
     def __init__(

@@ -28,7 +28,7 @@ class Option:
         help: Meaning; the default is appended unless the text states it.
         default: Value of an option that is not given.
         parse: Parser of the word, or of the list of words if several are allowed. None: the parser
-            of the metavar in `VALUE_TYPES`, or the words unchanged.
+            of the metavar in `VALUE_SYNTAXES`, or the words unchanged.
         required: Whether the option is mandatory.
         repeated: Whether the option may be repeated; the values are concatenated.
         key: Attribute of the value, if it differs from the name of the option.
@@ -86,8 +86,8 @@ class Option:
     @property
     def unit(self) -> str:
         """Unit of the numbers: "m", "rad", "pose" (both), "motor" (depends on the motor), or ""."""
-        is_typed = self.is_named and self.value_syntax in VALUE_TYPES
-        return VALUE_TYPES[self.value_syntax][1] if is_typed else ""
+        is_typed = self.is_named and self.value_syntax in VALUE_SYNTAXES
+        return VALUE_SYNTAXES[self.value_syntax][1] if is_typed else ""
 
     @property
     def help_text(self) -> str:
@@ -105,8 +105,8 @@ class Option:
         parse = self.parse
         if parse is None and self.choices:
             parse = choice(*self.choices)
-        elif parse is None and self.is_named and self.value_syntax in VALUE_TYPES:
-            parse = VALUE_TYPES[self.value_syntax][0]
+        elif parse is None and self.is_named and self.value_syntax in VALUE_SYNTAXES:
+            parse = VALUE_SYNTAXES[self.value_syntax][0]
         return words if parse is None else parse(words)
 
 
@@ -197,7 +197,7 @@ def word_list(parse: Callable[[str], Any]) -> Callable[[Sequence[str]], list[Any
     return lambda words: [parse(word) for word in words]
 
 
-VALUE_TYPES: dict[str, tuple[Callable[[Any], Any], str]] = {
+VALUE_SYNTAXES: dict[str, tuple[Callable[[Any], Any], str]] = {
     "N": (integer(1), ""),
     "SECONDS": (positive, ""),
     "METRES": (positive, "m"),
