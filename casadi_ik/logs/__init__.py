@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from casadi_ik.logs.cdr import NoMotionError, RecordedMotion, read_motion
+from casadi_ik.logs.cdr import RecordedMotion, read_motion
 from casadi_ik.logs.events import EventKind, EventRules, detect_events
 from casadi_ik.logs.explanation import Explanation, compare_solves, explain, match_targets
 from casadi_ik.logs.format import LogClock
@@ -28,7 +28,6 @@ __all__ = [
     "LoggedTarget",
     "McapRecorder",
     "MethodRows",
-    "NoMotionError",
     "RecordedMotion",
     "SolveRecord",
     "Table",

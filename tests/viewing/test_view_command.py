@@ -11,6 +11,7 @@ import pytest
 from commands import main
 
 import casadi_ik as ik
+from casadi_ik.logs.cdr import NoMotionError
 from casadi_ik.solve.solution_files import solution_data as as_json
 
 CANDIDATES = """robot: kuka_lwr_barrett
@@ -113,7 +114,7 @@ def test_logs_play_concurrently(view, robot: ik.ArmHand, tmp_path: Path) -> None
 def test_a_single_log_of_solves_opens(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     path = tmp_path / "cup.mcap"
     ik.Solver(robot).solve(ik.load_grasp("cup"), log=path)
-    with pytest.raises(ik.logs.NoMotionError):
+    with pytest.raises(NoMotionError):
         ik.logs.read_motion(path)
     (playback,) = view(str(path)).page.playbacks
     assert playback.unit == "iteration"

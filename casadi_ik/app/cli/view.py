@@ -32,7 +32,7 @@ from casadi_ik.files.reading import read_yaml
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.integrations.datasets import load_candidates
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
-from casadi_ik.logs import NoMotionError, RecordedMotion, read_motion
+from casadi_ik.logs.cdr import NoMotionError, RecordedMotion, read_motion
 from casadi_ik.logs.solve import SolveRecord, one_solve
 from casadi_ik.solve.solution_files import is_ranked, read_ranked
 
