@@ -11,7 +11,7 @@ __all__ = ["COMMANDS", "GROUPS", "load", "main", "schema_of", "view_of"]
 
 
 def view_of(*words: str) -> viewing.Viewer:
-    """What `casadi-ik view` shows, without waiting until it is stopped."""
+    """Return the viewer that `casadi-ik view` opens, without waiting for its end."""
     from casadi_ik.app.cli.view import open_viewer
 
     return open_viewer(parse(["view", *words])[1])

@@ -96,7 +96,7 @@ def coupled_oracle(coupled_robot: ik.ArmHand) -> PinocchioRobot:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    """One Chromium for all tests of a process; skips where there is none."""
+    """One Chromium for all tests of a process; tests are skipped without it."""
     if CHROMIUM is None:
         pytest.skip("no Chromium (on Debian: apt-get install chromium)")
     with Browser() as started:
@@ -105,7 +105,7 @@ def browser() -> Iterator[Browser]:
 
 @pytest.fixture
 def view() -> Iterator[Callable[..., Viewer]]:
-    """What `casadi-ik view` with some words shows, without waiting until it is stopped."""
+    """Function that opens the viewer of `casadi-ik view` without waiting for its end."""
     from commands import view_of
 
     with ExitStack() as stack:

@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def python(*words: object, path: object = ROOT, **options: Any) -> subprocess.CompletedProcess[str]:
-    """What a program said and how it ended: a file, `-m` and a module, or `-c` and its text.
+    """Run Python with a file, `-m` and a module, or `-c` and a program; return its result.
 
     Args:
         words: Of its command line; a text may be indented.
@@ -43,7 +43,7 @@ def python(*words: object, path: object = ROOT, **options: Any) -> subprocess.Co
 
 
 def output_of(*words: object, **options: Any) -> str:
-    """What a program says that ends well; options as `subprocess.run` has them.
+    """Return the output of a program that must succeed; options as in `subprocess.run`.
 
     Raises:
         AssertionError: It does not; the message is what it said.

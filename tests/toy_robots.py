@@ -105,7 +105,7 @@ def replace(path: Path, old: str, new: str) -> None:
 
 @contextmanager
 def edited(path: Path) -> Iterator[Any]:
-    """What a YAML file holds, to be changed in place; then it is written back."""
+    """Yield the data of a YAML file for changes and write them back."""
     data = yaml.safe_load(path.read_text())
     yield data
     path.write_text(yaml.safe_dump(data, sort_keys=False))

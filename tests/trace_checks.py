@@ -45,18 +45,18 @@ class TraceRecorder:
         self.blocks.append(block)
 
     def close(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def __enter__(self):
         return self
 
     def __exit__(self, *error) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
 
 @dataclass(frozen=True)
 class Promise:
-    """What the rows of a method tell.
+    """Promises of a method about the rows of its trace.
 
     Attributes:
         whole: Phases whose errors are those of the row's q (elsewhere the palm is not the arm's).
@@ -185,7 +185,7 @@ def _bits(mask: np.ndarray, count: int) -> NDArray[np.bool_]:
 
 
 def _check_phases(block: SolveBlock) -> None:
-    """As many rows of each phase as the solve counts."""
+    """Check that each phase has as many rows as the solve counts."""
     codes = {phase.label: int(phase) for phase in Phase}
     for row, rows in _solves(block):
         for label, counts in block.batch.phases.items():
@@ -255,7 +255,7 @@ def _check_accepted(block: SolveBlock, promise: Promise) -> None:
 
 
 def _check_active(block: SolveBlock) -> None:
-    """What a step brought to its limit it held there."""
+    """Check that a joint that reaches its limit is marked as active."""
     n = block.rows[Q.name].shape[1]
     at = _bits(block.rows[LIMIT_MASK.name], n)
     is_active = _bits(block.rows[ACTIVE_MASK.name], n)

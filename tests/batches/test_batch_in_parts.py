@@ -47,7 +47,7 @@ def unbroken_answers(
 
 
 def answers(path: Path) -> dict[str, np.ndarray]:
-    """What a file of answers holds but the times."""
+    """Return the content of a file of answers without its times."""
     with np.load(path) as arrays:
         return {name: arrays[name] for name in arrays.files if name not in ("time", "row")}
 
@@ -132,7 +132,7 @@ def test_terminated_batch_resumes(targets: Path, tmp_path: Path):
 
 
 def alive(group: int) -> bool:
-    """Whether any process of a group is left."""
+    """Return whether any process of a group is running."""
     try:
         os.killpg(group, 0)
     except ProcessLookupError:
@@ -266,7 +266,7 @@ def test_bad_targets(name: str, says: str, tmp_path: Path, capsys):
 def test_missing_extra_leaves_no_files(
     missing: str, robot: ik.ArmHand, tmp_path: Path, capsys, monkeypatch
 ):
-    """It is said before anything is written that would ask for --resume."""
+    """The error appears before anything is written that would need --resume."""
     points, normals = robot.contacts(robot.random(np.random.default_rng(4), 2))
     path = tmp_path / "targets.npz"
     np.savez(path, points=points, normals=normals)
@@ -298,7 +298,7 @@ def test_answers_are_written_as_npz_table_or_folder(
 @POSIX
 @pytest.mark.parametrize("wait_for", ["out.npz.parts", "out.npz.parts/part-*.npz"])
 def test_termination_leaves_no_partial_file(targets: Path, tmp_path: Path, wait_for: str) -> None:
-    """What is left after SIGTERM are whole parts with their logs; without a part, nothing."""
+    """After SIGTERM only complete parts with their logs remain; without a part, nothing."""
     out, logs = tmp_path / "out.npz", tmp_path / "logs"
     process = begun(targets, *ROBOT, *PARTS, "--jobs", 2, "--out", out, "--log", logs)
     while process.poll() is None and not list(tmp_path.glob(wait_for)):

@@ -69,7 +69,7 @@ def test_jacobian_by_central_differences(index, ar10, rng):
 
 
 def test_exact_data_are_explained_exactly(index, rng):
-    """What the data determine is found; what they do not, stays where the prior has it."""
+    """Observable parameters are recovered; unobservable ones keep their prior."""
     truth = true_values(index, rng)
     data = simulate(index, truth, "index", 50, rng, noise=EXACT)
     result = calibrate(index, data, sigma_position=1e-6, sigma_angle=1e-6)
@@ -90,7 +90,7 @@ def test_exact_data_are_explained_exactly(index, rng):
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_error_bars_are_true(loss, index):
-    """About 95 % of the 95 % intervals hold the true number, outliers or not."""
+    """About 95 % of the 95 % intervals contain the true value, with outliers too."""
     within_bars, noise = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)

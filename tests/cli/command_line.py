@@ -18,7 +18,7 @@ POSTURE = np.r_[
 
 @dataclass(frozen=True)
 class Run:
-    """How a command ended."""
+    """Result of a command."""
 
     exit: int
     out: str
@@ -31,7 +31,7 @@ class Run:
 
     @property
     def error(self) -> str:
-        """The one line of a refusal, behind the program's name."""
+        """Line of a refusal after the program's name."""
         assert self.exit == 2, self
         assert self.out == ""
         assert self.err.count("\n") == 1, self.err

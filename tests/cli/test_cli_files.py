@@ -21,7 +21,7 @@ TargetFile = Callable[..., Path]
 
 @pytest.fixture
 def unsolved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing may be solved in this test."""
+    """The solver must not be called in this test."""
     monkeypatch.setattr(ik.Solver, "solve_batch", None)
 
 

@@ -64,7 +64,7 @@ def commands(run: Command, group: str = "") -> Iterator[str]:
 
 
 def test_help(run: Command) -> None:
-    """It fits a terminal of 80 columns; without a word behind it, the program shows it."""
+    """Help fits a terminal of 80 columns; the program shows it without arguments."""
     names = ["", *commands(run)]
     assert {"solve", "batch", "view", "log", "log info", "log merge"} < set(names)
     for command in names:
@@ -262,7 +262,7 @@ def start_batch(targets: Path, out: Path, *options: str) -> subprocess.Popen[str
 
 
 def wait_for(folder: Path, finished: bool) -> bool:
-    """Whether a batch has begun its output, or even written rows, within ten minutes."""
+    """Return whether a batch has started its output, or written rows, within ten minutes."""
     # On a busy machine the first use may compile for minutes.
     deadline = time.monotonic() + 600
     while time.monotonic() < deadline:
@@ -276,7 +276,7 @@ def wait_for(folder: Path, finished: bool) -> bool:
 @pytest.mark.slow
 @POSIX
 def test_a_killed_batch(run: Command, tmp_path: Path) -> None:
-    """It leaves no result; what it leaves is removed by a later one that finds it old."""
+    """A killed batch leaves no result; a later one removes its old files."""
     robot = ik.load_robot(ROBOT)
     points, normals = robot.contacts(robot.random(np.random.default_rng(0), 300))
     targets, out = tmp_path / "targets.npz", tmp_path / "out.npz"

@@ -181,7 +181,7 @@ def test_limits_that_are_ignored(
 def test_joints_beyond_their_limits_are_named(
     coupled_robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those that follow an actuator by a coupling, too; each once."""
+    """Joints that follow an actuator by a coupling are named too, each once."""
     monkeypatch.setitem(sys.modules, "casadi_ik.app.pictures.thumbnail", None)
     description = coupled_robot.description
     for q in coupled_robot.random(np.random.default_rng(0), 20):

@@ -68,7 +68,7 @@ def scores(search, hands, arms, prefer):
 @pytest.mark.parametrize("branches", [False, True])
 @pytest.mark.parametrize("prefer", PREFERENCES)
 def test_compiled_search_is_no_worse_than_numpy(search, plain, robot, hands, prefer, branches):
-    """It looks at the same values and those between, and no closer."""
+    """Both search the same values, and the values between them."""
     compiled, simple = (
         run_search(arm_search, robot, hands, prefer, branches) for arm_search in (search, plain)
     )

@@ -26,7 +26,7 @@ def posts() -> ik.Scene:
 
 @pytest.mark.slow
 def test_calls_agree_at_the_edge_of_the_tolerance(robot):
-    """Where the contacts cannot be met exactly, or not without a collision, 2 % were missed."""
+    """Without the search, 2 % of such targets with obstacles were missed."""
     tolerance, rng = ik.Tolerance(5e-3, np.deg2rad(3)), np.random.default_rng(5)
     solver = ik.Solver(robot, tolerance=tolerance, scene=posts())
     q = robot.random(rng, 2500)

@@ -51,7 +51,7 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(PUBLISHED))
 def test_conventions_agree_with_the_published_hands(name: str) -> None:
-    """Where the last joints of the fingers are by another library in the published model."""
+    """The distal links are where another library has them in the published model."""
     published, convention = PUBLISHED[name], load_convention(name)
     described = ik.load_robot(ROBOTS.get(name.split("_")[1], KUKA)).description
     values = np.array([list(published["joints"].values())])
@@ -220,7 +220,7 @@ def test_bad_tables(changes: dict[str, Any], says: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_columns_that_are_not_joints(suffix: str, tmp_path: Path) -> None:
-    """As pandas writes a table: its index, a score, a note, and a cell that is empty."""
+    """A pandas table has an index, a score, a note, and an empty cell."""
     path = _table(tmp_path)
     head, row = path.read_text().splitlines()
     lines = ["0,{},0.9,good", "1,{},0.8,bad", "2,{},,good"]
@@ -240,7 +240,7 @@ def test_columns_that_are_not_joints(suffix: str, tmp_path: Path) -> None:
 
 
 def test_dro_files_are_distinguished_from_multidex(tmp_path: Path) -> None:
-    """Their rotations are three angles; read as columns of a matrix, hands would stand anywhere."""
+    """Rotations are three angles, not the columns of a matrix."""
     row = np.zeros(6 + 8)
     counts = {"num_total": 1, "num_upper_object": 1, "num_per_object": {"contactdb+apple": 1}}
     info = {hand: {"robot_name": hand, **counts} for hand in ("allegro", "barrett")}
@@ -451,7 +451,7 @@ def test_pregrasp_and_squeeze_stages(name: str, tmp_path: Path) -> None:
 
 
 class _Runs:
-    """What it holds would be called by a plain reader of pickles."""
+    """A plain reader of pickles would call the content."""
 
     def __init__(self, function: Any, *arguments: Any) -> None:
         self.held = function, arguments

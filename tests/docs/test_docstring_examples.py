@@ -93,7 +93,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def names(folder: Path) -> dict[str, Any]:
-    """What the examples use without saying so; the page of the interface shows how it is made."""
+    """Objects that the examples use without defining them, as the API page shows them."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     solver = ik.Solver(robot)
     offset_pose = np.eye(4)

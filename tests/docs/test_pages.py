@@ -71,7 +71,7 @@ def commands(text: str) -> Iterator[str]:
 
 
 def fault(line: str) -> str:
-    """What is wrong with a command, or ""."""
+    """Return the fault of a command, or ""."""
     words, name = shlex.split(line, comments=True)[1:], ""
     while words and name in GROUPS:
         if words[0] == "COMMAND":
@@ -93,7 +93,7 @@ def yaml_blocks(text: str) -> Iterator[Any]:
 
 
 def kind_of(data: Any) -> str:
-    """Which file it is, as far as it is a whole one."""
+    """Return the kind of a complete file."""
     keys = set(data) if isinstance(data, dict) else set()
     for key, kind in (("candidates", "candidates"), ("contacts", "grasp"), ("solids", "scene")):
         if key in keys:
@@ -107,7 +107,7 @@ def python_blocks(page: Path) -> list[str]:
 
 
 def printed(block: str, names: dict[str, Any]) -> str:
-    """What a block prints."""
+    """Return the output of a block."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
         exec(compile(block, "page", "exec"), names)
@@ -116,7 +116,7 @@ def printed(block: str, names: dict[str, Any]) -> str:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where a page's lines are run."""
+    """Return the folder in which the lines of a page run."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
     sys.modules.pop("make_grasp_sets", None)
@@ -214,7 +214,7 @@ def without_pictures(words: list[str]) -> list[str]:
 
 
 def missing(words: list[str]) -> bool:
-    """Whether a command reads what a reader has to bring along."""
+    """Return whether a command reads files that the reader has to provide."""
     values_of_options = [
         word
         for previous, word in pairwise(["", *words])

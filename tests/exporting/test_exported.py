@@ -109,7 +109,7 @@ int main(void) { /* pose of a box; rows of numbers: whether there is a q0, point
 @needs_gcc
 @pytest.mark.parametrize("name", ["two_ur10e+barrett_bh8_280", "mobile_kuka_lwr_barrett"])
 def test_exported_body_keeps_clear_of_scene_and_itself(tmp_path, name):
-    """Of targets that a posture meets which touches nothing; every third has an idle finger."""
+    """Return targets of collision-free postures; every third has an idle finger."""
     robot = ik.load_robot(name)
     write_folder(tmp_path, c_project(robot, "arm", 2))
     (tmp_path / "scene.c").write_text(IN_A_SCENE)
@@ -249,7 +249,7 @@ def malformed(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, ...]:
 @needs_gcc
 @pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid")
 def test_malformed_targets_have_the_same_status_as_in_python(plain_project):
-    """What Python refuses is bad input in C; all else ends alike, in the same configuration."""
+    """Inputs that Python refuses are bad inputs in C; other statuses and configurations agree."""
     robot, count = ik.load_robot("ar10"), 1500
     (plain_project / "asked.c").write_text(QUERY_PROGRAM)
     sources = [str(path.relative_to(plain_project)) for path in plain_project.glob("src/*.c")]

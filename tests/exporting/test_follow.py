@@ -75,7 +75,7 @@ def built(out: Path, name: str, text: str, sources: str, *flags: str) -> Path:
 
 
 def run_program(program: Path, *arrays: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """What it says: a status and a configuration a line."""
+    """Run the program and return the status and configuration of each line."""
     data = b"".join(np.ascontiguousarray(array, dtype=float).tobytes() for array in arrays)
     lines = [line.split() for line in output_of(program, input=data).splitlines()]
     return [int(line[0]) for line in lines], np.array(

@@ -66,7 +66,7 @@ def joint_positions(page: Page) -> np.ndarray:
 
 
 def settled(page: Page) -> None:
-    """Everything is done that was asked for, and the robot stands."""
+    """Wait until all requests are done and the robot stands still."""
     page.wait(f"{ANSWERED} && !casadiIk.viewport.framePending")
 
 
@@ -146,7 +146,7 @@ def pressed(page: Page, key: str, duration: int = 0) -> None:
 
 
 def copied(page: Page, button: str) -> str:
-    """What a button would put into the clipboard."""
+    """Return the text that a button copies to the clipboard."""
     page.evaluate(
         "globalThis.clip = '';"
         "Object.defineProperty(navigator, 'clipboard', { configurable: true,"
@@ -165,7 +165,7 @@ def the_answer_is_copied(page: Page) -> None:
 
 
 def a_link_has_the_question(page: Page, browser: Browser, url: str) -> None:
-    """What is asked is asked by whoever opens the link; a broken one is said to be broken."""
+    """A link restores the query; a broken link is reported as broken."""
     shown_expression = "[...casadiIk.now.shown]"
     page.evaluate("document.getElementById('reset').click()")
     pressed(page, "ArrowUp")

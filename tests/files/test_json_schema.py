@@ -82,7 +82,7 @@ def checker(kind: str) -> jsonschema.Draft7Validator:
 
 
 def reads(kind: str, data: Any) -> bool:
-    """What the reader of that kind of file says."""
+    """Return the error of the reader for that kind of file, or ""."""
     type_ = file_type(data) if kind in ("robot", "body") else FILES[kind][0]
     try:
         validated(data, type_, Path("file"))
@@ -109,7 +109,7 @@ def small(value: Any) -> Any:
 
 
 def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """Where anything stands in nested data; of long lists the first item speaks for all."""
+    """Yield the paths of all values in nested data; of long lists the first item only."""
     if path:
         yield path
     items = value.items() if isinstance(value, dict) else ()

@@ -151,7 +151,7 @@ def test_missing_binary_and_unknown(tmp_path: Path) -> None:
 
 
 def refused(path: Path, key: str, says: str) -> None:
-    """One line that names the file, the key and what is wrong."""
+    """The error names the file, the key and the fault."""
     with pytest.raises(ik.errors.DescriptionError) as caught:
         ik.load_grasp(path)
     message = str(caught.value)

@@ -64,7 +64,7 @@ def posed(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def pads(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray]:
-    """Where the pads' points have to be, which of a ball is not where it touches, and normals."""
+    """Return points of the pads (of balls their contact points) and normals."""
     points, normals, *_ = grasp.arrays(tuple(grasp.contacts))
     for i, (finger, contact) in enumerate(grasp.contacts.items()):
         if contact.ball is not None:

@@ -228,7 +228,7 @@ def test_a_tangent_that_is_not_across_the_normal_is_refused():
 
 
 def test_rounded_half_square_roots_are_accepted():
-    """What people type."""
+    """Rotations with four decimals, as people type them, are accepted."""
     turn = [[0.7071, -0.7071, 0, 0.5], [0.7071, 0.7071, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]
     c = np.sqrt(0.5)
     rotation = scene_file(yaml.safe_dump({"solids": {"a": BOX | {"pose": turn}}}))

@@ -83,7 +83,7 @@ def test_leftovers_of_killed_compilations_are_removed(directory):
 
 @needs_compiler
 def test_killed_compilation_does_not_block_others(directory):
-    """Its leftovers are not a library and do not block the next build."""
+    """The leftovers are not a library and do not block the next build."""
     text = """
         import casadi as ca
         from casadi_ik.compile import FunctionKernel, compiler

@@ -231,7 +231,7 @@ def test_malformed_variables(directory, monkeypatch, variable, value, expected_w
 @needs_compiler
 @pytest.mark.parametrize("name", ["qsort_r", "a" * 5000])
 def test_names_of_functions(directory, name):
-    """Of one of the C library, and too long for a file."""
+    """The names collide with the C library, or are too long for a file."""
     built_kernel = FunctionKernel(scaled(name=name))
     assert built_kernel.compiled
     assert built_kernel(3)[0] == 6

@@ -47,7 +47,7 @@ for step in (random_step(0), branching_step()):
 
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """One without any compiler on its path, and a cache of its own.
+    """Environment without a compiler on the path, with an empty cache.
 
     Zig's own is the user's: from nothing zig makes its libraries anew, which takes longer than all
     that is tested here.
@@ -88,7 +88,7 @@ COUNT = 40
 
 
 def iterates() -> bytes:
-    """Of steps one after the other and side by side."""
+    """Return the iterates of single steps and of lanes."""
     rng = np.random.default_rng(0)
     counts = []
     for step in (random_step(0), branching_step()):

@@ -125,7 +125,7 @@ HEAD = 9
 
 
 def read_messages(path: Path) -> list[tuple[str, int, bytes]]:
-    """What an independent reader finds, every checksum verified."""
+    """Return the messages that an independent reader finds, with all checksums verified."""
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
@@ -209,7 +209,7 @@ def test_damage_inside_a_log_is_refused_without_change(tmp_path: Path, closed: b
 
 
 def test_other_files_are_not_logs(tmp_path: Path, small: bytes) -> None:
-    """It is neither opened nor finished nor merged."""
+    """A log in use is neither opened nor finished nor merged."""
     files = {"empty": b"", "text": b"robot: ar10\n", "magic": MCAP0_MAGIC}
     files |= {"zeros": MCAP0_MAGIC + bytes(5000)}
     for name, data in files.items():
@@ -525,7 +525,7 @@ def with_chunk(folder: Path, chunk: Chunk) -> Path:
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.parametrize("expected_words", [GIGABYTES, 1000])
 def test_oversized_chunk_is_refused(tmp_path: Path, compression: str, expected_words: int) -> None:
-    """Whether it says so or not, and whether the compressed data say so or not."""
+    """The size may be stated in the header, in the compressed data, or in neither."""
     zeros = bytes(2**24)
     packed = {
         "zstd": lambda: zstandard.ZstdCompressor(

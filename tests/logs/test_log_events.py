@@ -31,7 +31,7 @@ Names = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Event:
-    """What a test expects."""
+    """Expected event."""
 
     iteration: int
     kind: logs.EventKind

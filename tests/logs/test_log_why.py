@@ -234,7 +234,7 @@ COUNT = 5
 
 @pytest.fixture(scope="module")
 def failed(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> list[logs.SolveRecord]:
-    """What enhanced-dls does not solve of the shipped grasps with random arms."""
+    """Unsolved shipped grasps of enhanced-dls with random arms."""
     names = ik.shipped_grasps(robot.name)
     q = robot.random(np.random.default_rng(0), len(names) * COUNT)
     for i, name in enumerate(names):

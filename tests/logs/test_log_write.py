@@ -49,7 +49,7 @@ def record_many(path: Path, blocks: int) -> None:
 def test_disk_full(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capacity: int, solves: int
 ) -> None:
-    """Nothing remains of a first chunk that does not fit; every other complete chunk is read.
+    """A first chunk that does not fit leaves nothing; every other complete chunk is read.
 
     A negative room is short of the whole log by so many bytes, which the summary lacks.
     """
@@ -91,7 +91,7 @@ def test_paths_that_cannot_be_written(tmp_path: Path) -> None:
 
 
 def test_a_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As root nothing is read-only: then only the refusal is made up."""
+    """Root may write read-only folders, so that the refusal is simulated."""
     folder = tmp_path / "locked"
     folder.mkdir(mode=0o500)
     if os.access(folder, os.W_OK):
@@ -149,7 +149,7 @@ def test_existing_log_is_kept_until_the_first_chunk(tmp_path: Path) -> None:
 def test_an_interrupt_while_a_chunk_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
 ) -> None:
-    """Its bytes are on the disk, but nobody knows it: the log goes on from where it ended."""
+    """The bytes of the interrupted chunk are overwritten: the log continues before it."""
     write, calls = os.write, []
 
     def interrupted(descriptor: int, data: Any) -> int:

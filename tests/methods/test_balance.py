@@ -81,7 +81,7 @@ def test_results_are_independent_of_batch_and_blocks(robot):
 
 
 def test_repeated_infeasible_minima_end_table_restarts(robot):
-    """They took every round, and up to 60 steps of a balance, to be given up."""
+    """Such targets used all restarts and up to 60 steps of a balance before they were given up."""
     points, normals = noisy(robot, np.random.default_rng(11), 1000)
     solver = ik.Solver(robot)
     batch = solver.solve_batch(points, normals)

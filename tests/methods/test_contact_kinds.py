@@ -187,7 +187,7 @@ def test_paper_methods_name_their_requirements(robot, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_answers_are_independent_of_other_targets(robot, solvers, method):
-    """Its own kinds decide which kernel solves it, and its number the random numbers."""
+    """The contact kinds of a target select its kernel, and its number the random numbers."""
     at = np.array([frames(robot, seed) for seed in range(4)])
     points, normals, tangents = at[..., :3, 3], at[..., :3, 0], at[..., :3, 1].copy()
     planes = np.full_like(points, np.nan)
@@ -397,7 +397,7 @@ def test_bad_arrays(robot, solvers):
 
 
 def test_sliding_contacts_give_no_proof(robot, solvers):
-    """Its point is far out of reach; the plane through it is not."""
+    """The point is far out of reach, but the plane through it is not."""
     at = frames(robot)
     far_point = at[0, :3, 3] + [5.0, 5.0, 0.0]
     other_contacts = {

@@ -89,7 +89,7 @@ def case(request) -> Case:
 
 
 def fields_equal(a: ik.BatchSolution, b: ik.BatchSolution, rows=slice(None)) -> None:
-    """Everything but the time is the same."""
+    """Assert that all fields but the times are equal."""
     for item in dataclasses.fields(ik.BatchSolution):
         left, right = getattr(a, item.name), getattr(b, item.name)
         if item.name == "phases":

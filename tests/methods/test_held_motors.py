@@ -13,7 +13,7 @@ import casadi_ik as ik
 def all_solved(
     robot: ik.ArmHand, fixed: dict[str, float], prefer: str = "limits", k: int = 12
 ) -> bool:
-    """Whether k targets that the robot reaches with motors held are solved, and keep them there."""
+    """Assert that k targets reachable with fixed motors are solved and keep them."""
     q = robot.random(np.random.default_rng(17), k)
     columns = [robot.actuators.index(name) for name in fixed]
     q[:, columns] = list(fixed.values())
@@ -90,7 +90,7 @@ def test_two_sphere_arm_joint_can_be_fixed_in_another_turn(tmp_path, prefer):
 
 @pytest.mark.parametrize("joints", [5, 3])
 def test_short_arms_and_wrists_are_placed_immediately(tmp_path, joints):
-    """They bring a palm where it is asked for by chance only: what is near is good enough."""
+    """Short arms rarely reach a palm pose exactly; a near configuration suffices."""
     robot = ik.load_robot(part_of_the_arm(tmp_path, slice(joints)))
     q = robot.random(np.random.default_rng(6), 25)
     for prefer in ("limits", "q0"):

@@ -117,7 +117,7 @@ def test_self_collision_free_solutions_are_found(name):
 
 
 def test_self_touching_hands_move_within_tolerance():
-    """Of contacts of random postures, most of which touch something, many can be met freely."""
+    """Random postures mostly collide, but many of their contacts can be met without collision."""
     robot = ik.load_robot("g1+dex3")
     solver, any_grasp = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home)
     q = robot.random(np.random.default_rng(0), 40)
@@ -287,7 +287,7 @@ def test_inconsistent_palms_are_refused():
 
 
 def held_box(robot):
-    """What a body holds at home, in the frame of the contacts' middle."""
+    """Return an object that a multi-arm robot holds at home, in the frame of its contacts."""
     points, normals = robot.contacts(robot.home)
     middle = points.mean(axis=0)
     return grasp_of(robot, points - middle, normals), middle

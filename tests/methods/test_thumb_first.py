@@ -71,7 +71,7 @@ def test_limits_ignored(robot, rng):
 
 
 def test_nearest_solution_is_chosen(robot, solver, rng):
-    """It moved as far as without a start, and from some solved nothing."""
+    """Such targets once moved as far as without a start, and some were not solved."""
     q, q0 = robot.random(rng, 400), robot.random(rng, 400)
     targets = robot.contacts(q)
     near_batch = solver.solve_batch(*targets, q0=q0)
@@ -111,7 +111,7 @@ def test_unreachable_targets_keep_the_best(robot, solver, rng):
 
 
 def test_the_start_chooses_between_hands(robot, single_start, rng):
-    """Of several hands for the same contacts, the one near q0 is begun with."""
+    """Of several hands for the same contacts, the search starts with the one near q0."""
     q = robot.random(rng, 200)
     around = np.clip(q + rng.normal(0, 0.3, q.shape), robot.lower, robot.upper)
     starts = (robot.home, around)

@@ -88,7 +88,7 @@ def test_palms_of_an_arm_with_limits_are_solved_within_tolerance(robot):
 
 
 def test_the_loop_has_a_queue_for_every_stage():
-    """It had twelve, whatever the method; the lanes then mixed stages."""
+    """The loop had twelve queues for every method; lanes then mixed stages."""
     body = ik.load_robot("two_pandas+allegro").description
     method: Any = build_method("hand-first", body, {})
     stages = method.graph.function

@@ -25,7 +25,7 @@ def clearances(solver, q):
 
 
 def test_targets_inside_a_table_are_not_followed(robot, solver):
-    """It stops short of the table, says so, and goes on when the targets come out again."""
+    """The robot stops before the table, reports it, and continues when targets leave the table."""
     points, normals = robot.contacts(robot.home)
     follower = solver.follow(robot.home, PERIOD)
     deep = np.concatenate([np.linspace(0, 0.7, 500), np.linspace(0.7, 0, 500), np.zeros(300)])
@@ -93,7 +93,7 @@ def led_through_each_other(body, shares):
 
 @pytest.mark.slow
 def test_hands_led_through_each_other_do_not_touch():
-    """They stop before each other, and follow again on the way back."""
+    """The hands stop before each other, and follow again on the way back."""
     body = ik.load_robot("g1+dex3")
     solver = ik.Solver(body, scene=ik.Scene())
     plain, careful = ik.Solver(body).follow(body.home, PERIOD), solver.follow(body.home, PERIOD)
@@ -140,7 +140,7 @@ def test_blocked_arm_slows_its_own_side():
 
 @pytest.mark.slow
 def test_passing_thumbs_keep_apart_in_every_cycle():
-    """They are at the ends of that way, and at places on it, 25 cycles from one to the next."""
+    """The thumbs come within 2 mm of each other and do not touch in any cycle."""
     body = ik.load_robot("g1+inspire")
     solver = ik.Solver(body, scene=ik.Scene())
     follower, shares = solver.follow(body.home), np.sin(np.linspace(0, np.pi, 2000))[:450] ** 2

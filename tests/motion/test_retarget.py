@@ -28,7 +28,7 @@ wrist_weight: 0.02
 
 @pytest.fixture
 def retarget(tmp_path):
-    """What a file of these keys says; of a robot: its thumb and the first two other fingers."""
+    """Write a retargeting file with these keys; default: thumb and the first two other fingers."""
 
     def read(robot=None, **keys):
         if robot is not None:
@@ -186,7 +186,7 @@ def test_image_landmarks_are_refused(robot, size, retarget):
 
 
 def test_a_left_hand_moves_a_right_robot_hand(robot, retarget):
-    """Its fingers come out as a right hand's, its wrist goes and turns as it does."""
+    """The fingers equal those of a right hand, and the wrist moves and rotates alike."""
     config = replace(retarget(robot), rpy=(0.0, 0.0, 0.0))
     right, left = (
         ik.motion.Retargeter(config, robot),
@@ -249,7 +249,7 @@ def test_nan_frame_is_ignored(robot, retarget):
 
 
 def test_arm_and_hand_follow_a_person(robot, retarget):
-    """Who moves as the robot can is followed by fingertips and wrist, whatever the scale."""
+    """A person who moves like the robot is followed by fingertips and wrist at any scale."""
     excursion = 0.15 * np.sin(np.linspace(0, np.pi, 120))[:, None] * np.sin(np.arange(14))
     path = robot.home + excursion
     fingers = {"thumb": 4, "finger_2": 8, "finger_3": 12}

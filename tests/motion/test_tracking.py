@@ -13,7 +13,7 @@ LEAP = 0.05
 
 
 def largest_step(robot, track) -> float:
-    """As a part of the motor's range."""
+    """Return the largest step of a motor as a fraction of its range."""
     return float((np.abs(np.diff(track.q, axis=0)) / (robot.upper - robot.lower)).max())
 
 

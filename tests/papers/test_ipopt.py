@@ -117,7 +117,7 @@ def test_impossible_contacts_are_met_as_well_as_by_hand_first(robot, targets):
 
 
 def test_free_fingers_and_normals(robot, solver, targets):
-    """What is free is not pulled anywhere: the rest is met although it could not be."""
+    """Free components are not constrained: the others are met although all could not be."""
     points, normals = (array[:4].copy() for array in targets)
     points[0, 2] = normals[0, 2] = np.nan
     points[1, 1:] = normals[1, 1:] = np.nan

@@ -98,7 +98,7 @@ def test_far_side_of_the_circle_is_avoided_by_ipopt(own_robot, rng):
 
 
 def miss(robot, name, q, points, normals) -> float:
-    """What eq. (5) minimises: distance of a finger from its point [m]."""
+    """Return the distance of a finger from its point, which eq. (5) minimises [m]."""
     tips, _ = seen_from_palm(robot, q)
     column = list(FLEXIONS).index(name)
     return float(np.linalg.norm(tips[:, column] - points[:, column]))
@@ -259,7 +259,7 @@ def test_most_pinches_are_solved(robot):
 
 @pytest.mark.slow
 def test_influential_and_neutral_choices(robot):
-    """One change each, with its effect."""
+    """Each variant changes one choice and has its effect."""
     points, normals = pinch_targets(robot, 4)
 
     def rate(**options):

@@ -201,7 +201,7 @@ def motion(robot):
 
 
 def displaced(robot, q, translation, rotation):
-    """Where fingers 2 and 3 get if the palm moves by a motion given in the palm frame."""
+    """Return positions of fingers 2 and 3 after a motion given in the palm frame."""
     points, normals = robot.contacts(q)
     palm = pin.SE3(robot.palm(q))
     moved_palm = palm * pin.SE3(pin.exp3(rotation), translation) * palm.inverse()

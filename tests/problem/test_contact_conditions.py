@@ -174,7 +174,7 @@ def own_errors(kind, data, frames):
 
 @every_kind
 def test_errors_are_distances_and_angles(robot, kind, rng):
-    """Of the residual, of the rotation vectors, and as they are measured: all three agree."""
+    """Errors from the residual, from rotation vectors and from measurements agree."""
     place, facing = kind.conditions
     for q, q_target in robot.random(rng, 10).reshape(5, 2, 14):
         data, rows = data_at(robot, q_target, rng), ContactRows((kind,) * 3)
@@ -240,7 +240,7 @@ def test_frame_without_tangent_is_a_normal(robot, rng):
 
 
 def test_best_palm_uses_tangents(robot, rng):
-    """One finger with its whole frame fixes the palm of a posture; point and normal do not."""
+    """A full frame of one finger determines the palm of a posture; point and normal do not."""
     (q,) = robot.random(rng, 1)
     weights = np.array([[1.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
     p = parameters(data_at(robot, q, rng), weights)
@@ -284,7 +284,7 @@ def test_contact_frames_contain_the_contacts(robot, coupled_robot, rng):
 
 
 def test_the_tangent_is_the_x_axis_of_the_described_contact_frame(robot, rng):
-    """Of the Barrett hand it runs along the last phalanx."""
+    """The tangent of the Barrett hand runs along the distal phalanx."""
     (q,) = robot.random(rng, 1)
     links = robot.links(q)
     for finger, frame in zip(robot.description.fingers, robot.contact_frames(q), strict=True):

@@ -90,7 +90,7 @@ class Wire(CouplingKind, frozen=True, tag="wire"):
 
 
 def test_an_unknown_kind_is_an_error(coupled_robot):
-    """It is never taken for a four-bar, nor passed over."""
+    """An unknown kind is neither taken for a four-bar nor skipped."""
     (joint,) = (joint for joint in coupled_robot.description.movable if joint.name == "left_4")
     wired = dataclasses.replace(joint, coupling=Wire("left_3"))  # type: ignore[arg-type]
     for ask in (follow, coupling_rate):

@@ -63,7 +63,7 @@ def test_pads_face_the_flexion_direction(ar10):
 
 
 def test_published_ranges(ar10):
-    """What Chandra's code gives: 1.531 and 1.222 rad, distal 0 to 0.606; thumb 1.623, 0.848."""
+    """Chandra's code gives 1.531 and 1.222 rad, distal 0 to 0.606; thumb 1.623, 0.848."""
     ends = ar10.joints(np.stack([ar10.lower, ar10.upper]))
     spans = {name: values[1] - values[0] for name, values in ends.items()}
     for finger in FINGERS:

@@ -197,7 +197,7 @@ def test_arm_placements_must_all_be_given(tmp_path: Path):
 
 
 def refused(path: Path, expected_words: str):
-    """One line that names the file is said of it."""
+    """Assert that the robot is refused with one line that names the file."""
     with pytest.raises(ik.errors.DescriptionError) as caught:
         ik.load_robot(path)
     assert expected_words in str(caught.value)

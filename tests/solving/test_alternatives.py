@@ -58,7 +58,7 @@ def min_difference(robot, solutions):
 
 @pytest.mark.parametrize("prefer", ["limits", "manipulability", "q0"])
 def test_cup_alternatives_differ(robot, solver, prefer):
-    """Its hand has a valley of postures; without a least distance they fill the list."""
+    """The hand has a continuum of postures; without a minimum distance they fill the list."""
     cup = ik.load_grasp("cup")
     all_solutions = solver.solve_all(cup, limit=1000, prefer=prefer, apart=0)
     assert min_difference(robot, all_solutions) < 0.1

@@ -133,7 +133,7 @@ def test_normal_that_faces_away(
 
 
 def test_diagnosis_uses_the_object_pose(solver: ik.Solver) -> None:
-    """One pose of the object, several targets to be tried."""
+    """The diagnosis tries several targets with the same object pose."""
     grasp = ik.load_grasp("cup")
     up = np.eye(4)
     up[2, 3] = 0.15
@@ -242,7 +242,7 @@ def test_other_methods_use_hand_first(robot: ik.ArmHand, cup: tuple[Array, Array
 
 
 def test_nearest_contacts(solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
-    """They are where the robot can be, and the tolerance said to be enough is."""
+    """The nearest contacts are reachable, and the stated tolerance suffices."""
     diagnosis = diagnosed(solver, cup[0] + [0.5, 0, 0], cup[1])
     points, normals = robot.contacts(diagnosis.q)
     for i, name in enumerate(robot.fingers):
@@ -346,7 +346,7 @@ def batch_of(
 
 @pytest.mark.parametrize("finger", range(3))
 def test_free_finger(robot: ik.ArmHand, cup: tuple[Array, Array], finger: int) -> None:
-    """What two fingers reach is never unreachable; what they do not is said to be too far."""
+    """Targets that two fingers reach are never unreachable; others are too far."""
     solver, rng = ik.Solver(robot), np.random.default_rng(finger)
     q = robot.random(rng, 200)
     q = np.where(rng.random(q.shape) < 0.3, robot.upper, q)
@@ -366,7 +366,7 @@ def test_free_finger(robot: ik.ArmHand, cup: tuple[Array, Array], finger: int) -
 
 
 def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
-    """They are nobody's relief, and what can be reached without them is never unreachable."""
+    """Free fingers are not remedies, and reachable targets are never unreachable."""
     solver, rng = ik.Solver(robot), np.random.default_rng(4)
     for name in ("lwr_joint_3", "bh_spread"):
         column = robot.actuators.index(name)

@@ -46,7 +46,7 @@ def test_invalid_limits_are_refused(robot):
 
 
 def test_palms_out_of_the_arms_reach_are_not_searched(robot, rng):
-    """They went through all rounds, though their hand is given: up to 100 ms each."""
+    """Such palms used all restarts although their hand is given: up to 100 ms each."""
     q = robot.random(rng, 80)
     palms = robot.palm(q)
     palms[40:, :3, 3] *= 1.0 / np.linalg.norm(palms[40:, :3, 3], axis=1, keepdims=True) * 1.6

@@ -27,7 +27,7 @@ class Answering:
         self.status = status
 
     def prepare(self):
-        """Nothing to do."""
+        """Do nothing."""
 
     def run(self, problems, q0, seed, trace):
         k = len(problems)
@@ -61,7 +61,7 @@ def test_limits_are_part_of_success_where_enforced(robot, enforce):
     "status", [ik.Status.ITERATION_LIMIT, ik.Status.STALLED, ik.Status.INVALID]
 )
 def test_verdict_overrides_the_method(robot, status):
-    """What meets its contacts is solved; what does not keeps the method's word for it."""
+    """Targets whose contacts are met are solved; others keep the status of the method."""
     q = np.tile(robot.home, (2, 1))
     goals = q.copy()
     goals[1, 0] += 0.5

@@ -94,7 +94,7 @@ def test_background_compilation_may_be_killed(tmp_path: Path) -> None:
 def test_harder_targets_wait_for_the_compiler(
     robot: ik.ArmHand, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So nobody's answer depends on when it was asked for."""
+    """Answers do not depend on the state of the compilation."""
     points, normals = robot.contacts(robot.home)
     grasp = grasp_of(robot, points + 5.0, normals)
     expected = ik.Solver(robot).solve(grasp)

@@ -52,7 +52,7 @@ def test_unreachable_palm_is_diagnosed():
     [("ur5e+robotiq_2f85", 2, 160), ("jaco2+panda_hand", 2, 480), ("puma560+jaco_3f", 1, 220)],
 )
 def test_free_palm_components_are_searched(name, fingers, count):
-    """Of these reachable targets 1, 5 and 6 were missed."""
+    """Targets 1, 5 and 6 of these reachable ones were once missed."""
     robot, solver = robot_of(name), solver_of(name)
     points, normals = robot.contacts(robot.random(np.random.default_rng(11), count))
     if fingers == 1:

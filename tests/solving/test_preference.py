@@ -30,7 +30,7 @@ def path(robot, rng, steps):
 
 
 def test_small_path_steps_cause_no_jump(robot, rng):
-    """It was up to 208 degrees."""
+    """The largest step was 208 degrees before."""
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
     for _ in range(4):
         path_targets = path(robot, rng, 40)

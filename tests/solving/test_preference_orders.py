@@ -38,7 +38,7 @@ def starts(robot, rng):
 
 
 def targets(solver, rng):
-    """Of random postures, whether they are free or not, some of them out of reach; the postures."""
+    """Draw random postures, collision-free or not, and targets of them, some out of reach."""
     robot = solver.robot
     q = robot.random(rng, COUNT)
     points, normals = robot.contacts(q)

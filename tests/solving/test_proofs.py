@@ -40,7 +40,7 @@ def batch_of_targets(
 
 
 def wrongly(robot: ik.ArmHand, prover: Prover, q: Array, problems: TargetBatch) -> int:
-    """How many proofs would refute a box of hands that holds the hand of q."""
+    """Return the number of proofs that would refute a box of hands around the hand of q."""
     places = robot.joints(q) | dict(zip(robot.actuators, q.T, strict=True))
     proofs = prover.prove(problems, prover.space.from_positions(places, problems))
     return sum(proof is not None for proof in proofs)
@@ -94,7 +94,7 @@ def test_targets_within_tolerance_are_not_disproved(
 
 
 def test_wrong_hand_is_refuted(robot: ik.ArmHand, prover: Prover) -> None:
-    """What is looked for is found: boxes that hold another hand are refuted."""
+    """The refutation works: boxes around another hand are refuted."""
     q = robot.random(np.random.default_rng(8), 40)
     problems = batch_of_targets(robot.contacts(q), 5e-3, np.deg2rad(3), True)
     assert wrongly(robot, prover, q[::-1], problems) >= 38
@@ -340,7 +340,7 @@ def test_unproved_targets_are_not_unreachable(
 
 
 def test_near_misses_use_few_boxes(robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing excludes it before boxes are small; it took a quarter of a second each time."""
+    """Such targets are excluded only by small boxes; each took a quarter of a second."""
     solver, boxes = ik.Solver(robot), []
     prove = solver._engine.diagnostician._prover.prove
 

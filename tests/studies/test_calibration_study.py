@@ -9,7 +9,7 @@ STUDIES = Path(__file__).parents[2] / "studies"
 
 
 def coverages(report: str) -> list[float]:
-    """What the 95 % intervals held, of every loss and part of outliers [%]."""
+    """Return the coverage of the 95 % intervals by loss and share of outliers [%]."""
     rows = re.findall(r"^\| \d+ % \| \w+ \| ([\d.]+) % \|", report, re.MULTILINE)
     return [float(row) for row in rows]
 

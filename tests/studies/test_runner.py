@@ -181,7 +181,7 @@ def test_a_changed_seed_is_one_line(done):
 
 
 def test_the_logs_of_a_study_are_one_log(tmp_path):
-    """Of two settings, each block counting from 0 and with a sample of its own."""
+    """The blocks of two settings count from 0 and have samples of their own."""
     study = dataclasses.replace(STUDY, sets=STUDY.sets[:1], count=8)
     run(study, tmp_path / "study", log=ik.logs.Keep())
     merged = ik.logs.merge_logs(tmp_path / "study", tmp_path / "all.mcap")

@@ -307,7 +307,7 @@ def test_unlimited_variants_take_the_same_step(robot, problem, steps, rng):
 
 
 def test_both_variants_keep_limits(robot, problem, steps, rng):
-    """What is fixed stands at its limit, and the thumb keeps its place as far as it can."""
+    """Bound joints are at their limits, and the thumb keeps its position as well as possible."""
     fixed, agree, total = 0, 0, 0
     for q, linear in cases(robot, rng, problem, 40):
         lower, upper = robot.lower - q, robot.upper - q

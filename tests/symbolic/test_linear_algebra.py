@@ -291,7 +291,7 @@ def test_every_step_descends_and_stays_within(step, rng, passes):
 
 
 def test_bound_coordinate_is_released_when_pulled_inside(step):
-    """Its own slope points outwards, but not once the others have moved."""
+    """The slope of the coordinate points outwards until the others have moved."""
     J, r = np.zeros((M, N)), np.zeros(M)
     J[:N, :N] = np.eye(N)
     J[3, 4] = -1.0

@@ -297,7 +297,7 @@ def best():
 
 
 def contraction(B):
-    """What 128 steps of the power iteration leave of an error, from Davenport's eigenvalues."""
+    """Return the remaining error of 128 power iterations, from Davenport's eigenvalues."""
     B = B / np.linalg.norm(B)
     z = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
     K = np.block(

@@ -60,7 +60,7 @@ LINE = np.array([[[-0.03, 0, 0], [0.03, 0, 0], [0.01, 0, 0]]])
     ],
 )
 def test_loads_of_any_contacts_match_linear_programs(points, normals, off, rng):
-    """What nothing holds is 0; HiGHS is not surer than `off` where contacts nearly depend."""
+    """Unsupported directions have load 0; HiGHS has an error of `off` for dependent contacts."""
     for count in (2, 3, 5) if points is None else (3,):
         at = 0.03 * rng.normal(size=(6, count, 3)) if points is None else points
         if off > 1e-9:
@@ -204,7 +204,7 @@ def test_required_load_is_held(surface):
 
 @pytest.mark.slow
 def test_motor_torques_limit_the_squeeze(surface):
-    """The one that is used most has all that it can, by differences of its fingertips' places."""
+    """The most loaded motor has its maximum torque, by differences of the fingertips."""
     solver = solver_of("panda+leap")
     robot = solver.robot
     options = {"limit": 5, "among": 5, "hold": (0.15, 1000.0)}
@@ -227,7 +227,7 @@ def test_motor_torques_limit_the_squeeze(surface):
 
 @pytest.mark.slow
 def test_enveloping_fingers_support_the_object(surface, tmp_path):
-    """Their links alone, and no deeper than the scene says; plain scenes refuse these hands."""
+    """Only finger links lean on it, no deeper than permitted; plain scenes refuse these hands."""
     robot, deep = ik.load_robot("panda+leap"), 0.006
     text = f"enveloping: {deep}\n{ik.load_scene('table').text()}"
     (tmp_path / "leaning.yaml").write_text(text)

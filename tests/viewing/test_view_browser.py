@@ -62,7 +62,7 @@ def opened(browser: Browser, viewer: viewing.Viewer, painted: bool = False) -> t
 
 
 def pixel(page: Page, client: Any, point: np.ndarray) -> np.ndarray:
-    """Where a point of the base frame is on the page [CSS pixels]."""
+    """Return the position of a point of the base frame on the page [CSS pixels]."""
     box = page.evaluate(
         "(({x, y, width, height}) => [x, y, width, height])"
         "(document.querySelector('canvas').getBoundingClientRect())"

@@ -54,7 +54,7 @@ def test_a_dragged_contact_and_normal_are_reached(cup: viewing.Viewer) -> None:
 
 
 def test_links_match_the_kinematics(cup: viewing.Viewer, rng: np.random.Generator) -> None:
-    """What a browser makes of poses that are sent link on link is the robot's kinematics."""
+    """Link poses that a browser composes equal the robot's kinematics."""
     page, robot = cup.page, cup.page.robot
     page.drag_motors(robot.random(rng, 1)[0])
     assert page.work.settle(300)

@@ -58,7 +58,7 @@ def send(page: Connection, *messages: Any) -> None:
 
 
 def greeted(page: Connection) -> bool:
-    """Whether the page sends what is on it."""
+    """Return whether the page delivers its content."""
     send(page, CAMERA)
     return len(page.recv(120)) > 100
 
@@ -73,7 +73,7 @@ def fetch_page(url: str, **headers: str) -> tuple[int, bytes]:
 
 
 def dragged(viewer: viewing.Viewer) -> dict[str, Any]:
-    """What a browser sends when the first contact is moved."""
+    """Return the message of a browser that moves the first contact."""
     control = viewer.page._handles._controls[viewer.page.robot.fingers[0]].handle
     position = control.position + np.array([0.0, 0.002, 0.0])
     return {
@@ -85,7 +85,7 @@ def dragged(viewer: viewing.Viewer) -> dict[str, Any]:
 
 
 def pressed(handle: Any) -> dict[str, Any]:
-    """What a browser sends when a button is pressed."""
+    """Return the message of a browser that presses a button."""
     return {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {"value": True}}
 
 

@@ -15,7 +15,7 @@ from casadi_ik.app import pictures as views
 
 
 class Page(HTMLParser):
-    """What a page holds."""
+    """Return the parts of a page."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
