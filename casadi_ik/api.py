@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Generator, Iterable, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from typing import Any, Self
 
@@ -21,7 +21,7 @@ from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import Free
-from casadi_ik.model.targets import LIMIT_MODES, TargetBatch, Tolerance
+from casadi_ik.model.targets import LIMIT_MODES, Tolerance
 from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.papers.qiu.step import FINGER_STEPS
 from casadi_ik.planning.choose import choose
@@ -32,9 +32,13 @@ from casadi_ik.solve.engine import Engine, SolvedBlock, SolveOptions
 from casadi_ik.solve.fast import FastSolver
 from casadi_ik.solve.recorder import Recorder
 from casadi_ik.solve.registry import build_method, method_names, with_finger_step
-from casadi_ik.solve.request import Request, broadcast_postures, tolerances_by_finger
 from casadi_ik.solve.sensitivity import Sensitivity
 from casadi_ik.solve.solution import Alternative, BatchSolution, Solution
+from casadi_ik.solve.target_builder import (
+    TargetBuilder,
+    broadcast_postures,
+    tolerances_by_finger,
+)
 
 METHODS = method_names()
 """Names of the shipped methods, the default first."""
@@ -123,11 +127,13 @@ class Solver(MovingSolver):
         self.tolerances = tolerances_by_finger(tolerance, robot.fingers)
         self.limits = limits
         self.options = with_finger_step(method, options or {}, finger_step)
-        self._request = Request(robot, self.tolerances, limits == "enforce")
         self.scene = scene
         check = None if scene is None else SceneCheck(robot, scene, compiled)
         built_method = build_method(method, robot.description, self.options, compiled)
         self._engine = Engine(robot, built_method, compiled, check=check)
+        self._target_builder = TargetBuilder(
+            robot, self.tolerances, limits == "enforce", built_method, has_scene=scene is not None
+        )
 
     @cached_property
     def _single_restart_engine(self) -> Engine:
@@ -208,31 +214,25 @@ class Solver(MovingSolver):
             >>> print(round(solution.q[2], 6))
             0.2
         """
-        targets = self._request.of_grasps(
-            [grasp], fixed, self._engine.resolve_preference(prefer, q0 is not None), free=True
+        targets = self._target_builder.from_grasps(
+            [grasp], fixed=fixed, q0=q0, prefer=prefer, seed=seed, allow_free_pose=True
         )
         if isinstance(grasp.object_pose, Free):
             if log is not None:
                 raise InputError("log: a Free object_pose cannot be logged; expected a fixed pose")
-            start = self.robot.start(q0)
             return solve_with_object(
-                lambda group, why: self._engine.solve(
-                    group, SolveOptions(start, seed, diagnose=why)
-                ),
-                lambda group: self._single_restart_engine.solve(group, SolveOptions(start, seed)),
+                lambda group, why: self._engine.solve(group, SolveOptions(diagnose=why)),
+                lambda group: self._single_restart_engine.solve(group, SolveOptions()),
                 lambda group, most: self._engine.diagnostician.prove(group, most),
                 targets,
                 grasp.object_pose,
-                start,
-                self.robot.upper - self.robot.lower,
+                self.robot,
             )
         if log is None:
-            options = SolveOptions(q0, seed, diagnose=diagnose, best_effort=best_effort)
+            options = SolveOptions(diagnose=diagnose, best_effort=best_effort)
             return self._engine.solve_one(targets, options)
         with recorder_of(self, log, seed) as recorder:
-            options = SolveOptions(
-                q0, seed, recorder=recorder, diagnose=diagnose, best_effort=best_effort
-            )
+            options = SolveOptions(recorder=recorder, diagnose=diagnose, best_effort=best_effort)
             return self._engine.solve(targets, options).solution(0)
 
     def solve_batch(
@@ -287,14 +287,14 @@ class Solver(MovingSolver):
             >>> batch.q.shape, bool(batch.success.all())
             ((1000, 14), True)
         """
-        fixed_q = self._request.fixed_vector(fixed)
-        preference = self._engine.resolve_preference(prefer, q0 is not None)
-        targets = self._request.of_arrays(points, normals, fixed_q, more=more, prefer=preference)
+        targets = self._target_builder.from_arrays(
+            points, normals, more, fixed=fixed, q0=q0, prefer=prefer, seed=seed
+        )
         if object_pose is not None:
             targets = targets.holding(grasped_in(self.scene), object_pose)
         with recorder_of(self, log, seed, keep, compression) as recorder:
             options = SolveOptions(
-                q0, seed, jobs, recorder, diagnose, show_progress=True, best_effort=best_effort
+                jobs, recorder, diagnose, show_progress=True, best_effort=best_effort
             )
             return self._engine.solve(targets, options)
 
@@ -342,15 +342,17 @@ class Solver(MovingSolver):
             >>> [int(block.solution.success.sum()) for block in solver.solve_blocks(blocks)]
             [500, 500, 500]
         """
-        fixed_q = self._request.fixed_vector(fixed)
-        preference = self._engine.resolve_preference(prefer, q0 is not None)
-
-        def parse(block: Mapping[str, ArrayLike], first_row: int) -> TargetBatch:
-            return self._request.of_named(block, fixed_q, first_row, preference)
-
+        start = None if q0 is None else self._target_builder.start(q0)
+        parse = partial(
+            self._target_builder.from_named_arrays,
+            fixed=fixed,
+            q0=start,
+            prefer=prefer,
+            seed=seed,
+        )
         with recorder_of(self, log, seed) as recorder:
             tolerances = tuple(self.tolerances.values())
-            options = SolveOptions(q0, seed, jobs, recorder, diagnose, best_effort=best_effort)
+            options = SolveOptions(jobs, recorder, diagnose, best_effort=best_effort)
             yield from self._engine.solve_blocks(blocks, parse, tolerances, options, first_row)
 
     def stepper(self, grasp: Grasp, q0: ArrayLike | None = None) -> Stepper:
@@ -369,9 +371,9 @@ class Solver(MovingSolver):
             >>> type(stepper).__name__
             'Stepper'
         """
-        preference = self._engine.resolve_preference(None, q0 is not None)
-        targets = self._request.of_grasps([grasp], None, preference)
-        return self._engine.engine_for(targets).method.stepper(targets, self._request.start(q0))
+        start = None if q0 is None else self._target_builder.start(q0)
+        targets = self._target_builder.from_grasps([grasp], q0=start)
+        return self._engine.engine_for(targets).method.stepper(targets)
 
     def fast(self) -> FastSolver:
         """Return a solver of single targets for control loops, see `FastSolver`.
@@ -386,7 +388,7 @@ class Solver(MovingSolver):
             >>> ik.Status(status).name
             'SOLVED'
         """
-        return FastSolver(self._engine, self._request)
+        return FastSolver(self._engine, self._target_builder)
 
     def solve_all(
         self,
@@ -427,10 +429,13 @@ class Solver(MovingSolver):
             >>> len(several), several[0].manipulability >= several[1].manipulability
             (4, True)
         """
-        targets = self._request.of_grasps([grasp], fixed)
-        finder = self._engine.engine_for(targets).finder
-        start, query = self._request.start(q0), self._engine.collision_query(targets)
-        return finder.find(targets, start, seed, limit, prefer, apart, query)
+        targets = self._target_builder.from_grasps([grasp], fixed=fixed, seed=seed)
+        finder, query = (
+            self._engine.engine_for(targets).finder,
+            self._engine.collision_query(targets),
+        )
+        targets = targets.starting_at(self._target_builder.start(q0))
+        return finder.find(targets, limit, prefer, apart, query)
 
     def solve_palms(
         self,
@@ -477,12 +482,11 @@ class Solver(MovingSolver):
         poses = checked_pose(palms, "palms")
         if poses.ndim != 3:
             raise InputError(f"palms: found shape {poses.shape}, expected (k, 4, 4)")
-        hands = broadcast_postures(self._request.robot, postures, len(poses))
-        preference = self._engine.resolve_preference(prefer, q0 is not None)
-        targets = self._request.of_palms(poses, hands, fixed, preference)
-        options = SolveOptions(
-            q0, seed, jobs, None, diagnose, show_progress=True, best_effort=best_effort
+        hands = broadcast_postures(self.robot, postures, len(poses))
+        targets = self._target_builder.from_palms(
+            poses, hands, fixed=fixed, q0=q0, prefer=prefer, seed=seed
         )
+        options = SolveOptions(jobs, diagnose=diagnose, show_progress=True, best_effort=best_effort)
         return self._engine.solve(targets, options)
 
     choose = choose
@@ -523,7 +527,7 @@ class Solver(MovingSolver):
             (1, 14, 3, 3)
         """
         configurations = self.robot.configuration(q)
-        targets = self._request.of_arrays(points, normals, None, more=more)
+        targets = self._target_builder.from_arrays(points, normals, more)
         k, n = len(targets), len(self.robot.actuators)
         if configurations.shape != (k, n):
             raise InputError(f"q: found shape {configurations.shape}, expected {(k, n)}")
@@ -591,7 +595,7 @@ class Solver(MovingSolver):
             >>> bool(at_table.check(solution.q, grasp).distance[0] > 0)
             True
         """
-        targets = self._request.of_grasps([grasp], None)
+        targets = self._target_builder.from_grasps([grasp])
         query = self._engine.collision_query(targets)
         return query and query.check(np.atleast_2d(self.robot.configuration(q)))
 

@@ -93,12 +93,12 @@ def solve(part: Part) -> dict[str, Any]:
     batch = solver.solve_batch(points, normals, best_effort=True)
     seconds = (time.process_time() - begin) / part.size
     rows = np.flatnonzero(batch.status == ik.Status.NEAREST)
-    targets = solver._request.of_arrays(points[rows], normals[rows], None)
+    targets = solver._target_builder.from_arrays(points[rows], normals[rows])
     search: NearestSearch = solver._engine.nearest_search
     distance = search.distances(targets, np.arange(len(rows)), batch.q[rows])
     reference = distance.copy()
     for _ in range(part.starts):
-        minima = search.descend(targets, robot.random(rng, len(rows)))
+        minima = search.descend(targets.starting_at(robot.random(rng, len(rows))))
         reference = np.minimum(reference, search.distances(targets, np.arange(len(rows)), minima))
     gap = distance / reference - 1
     return {

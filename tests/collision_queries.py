@@ -13,7 +13,7 @@ from casadi_ik.files.arrays import Array
 
 def query_of_grasps(solver: ik.Solver, grasps: Sequence[ik.Grasp]) -> CollisionQuery:
     """Return the collision query about the targets of grasps."""
-    return _query(solver, solver._request.of_grasps(grasps, None))
+    return _query(solver, solver._target_builder.from_grasps(grasps))
 
 
 def query_of_contacts(
@@ -23,7 +23,7 @@ def query_of_contacts(
     held: tuple[str, Array] | None = None,
 ) -> CollisionQuery:
     """Return the collision query about contacts (k, f, 3); `held`: object and poses (k, 4, 4)."""
-    targets = solver._request.of_arrays(points, normals, None)
+    targets = solver._target_builder.from_arrays(points, normals)
     return _query(solver, targets if held is None else targets.holding(*held))
 
 

@@ -24,8 +24,8 @@ from casadi_ik.solve.engine import Engine
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.registry import build_method
-from casadi_ik.solve.request import Request
 from casadi_ik.solve.status import Status
+from casadi_ik.solve.target_builder import TargetBuilder
 
 TARGET_COUNT = 1000
 """Number of targets that the test of an export solves."""
@@ -119,19 +119,16 @@ def _answers(
         batch = solver.solve_batch(points, normals, q0=starts)
         yield from zip(batch.q, batch.status, batch.iterations, batch.restarts, strict=True)
         return
-    method, request = (
+    method, builder = (
         HandFirstMethod(robot, HandFirstParameters()),
-        Request(solver.robot, solver.tolerances, True),
+        TargetBuilder(solver.robot, solver.tolerances),
     )
     search = method.new_search(enforce_limits=True)
     assert search is not None
     for row in range(len(points)):
         q0 = None if starts is None else starts[row]
-        prefer = "limits" if q0 is None else "q0"
-        target = request.of_arrays(
-            points[row : row + 1], normals[row : row + 1], None, prefer=prefer
-        )
-        search.set_target(target, 0, request.start(q0), method.terms(target))
+        target = builder.from_arrays(points[row : row + 1], normals[row : row + 1], q0=q0)
+        search.set_target(target, 0, method.terms(target))
         answer = search.result(search(method.rounds) or 0)
         yield answer.q, answer.status, answer.iterations, answer.restarts
 
@@ -301,8 +298,8 @@ class SceneTargets:
     def _collision_result(self, target: dict[str, Any]) -> dict[str, Any]:
         """Return status and clearance of the solution of a multi-arm robot, without a search."""
         points, normals = (np.reshape(target[key], (1, -1, 3)) for key in ("points", "normals"))
-        request = Request(self.solver.robot, self.solver.tolerances, True)
-        query = self._check.collision_query(request.of_arrays(points, normals, None))
+        builder = TargetBuilder(self.solver.robot, self.solver.tolerances)
+        query = self._check.collision_query(builder.from_arrays(points, normals))
         clear = query.check(np.array(target["q"])[None])
         if not clear.free[0]:
             return {"status": int(Status.COLLISION), "clearance": None}
@@ -312,16 +309,13 @@ class SceneTargets:
         self, points: Array, normals: Array, q: Array, q0: list[float] | None
     ) -> tuple[Array, float] | None:
         """Return a collision-free solution and its clearance [m]; None if the search fails."""
-        engine, request = self._engine, Request(self.solver.robot, self.solver.tolerances, True)
-        prefer = "limits" if q0 is None else "q0"
-        targets = request.of_arrays(points, normals, None, prefer=prefer)
+        engine, builder = self._engine, TargetBuilder(self.solver.robot, self.solver.tolerances)
+        targets = builder.from_arrays(points, normals, q0=q0)
         query = engine.collision_query(targets)
         assert query is not None
         clear = query.check(q[None])
         if not clear.free[0]:
-            resolved = resolve_single(
-                engine.finder, targets, query, q, request.start(q0), try_other_hands=True
-            )
+            resolved = resolve_single(engine.finder, targets, query, q, try_other_hands=True)
             if resolved is None:
                 return None
             q, _, clear = resolved

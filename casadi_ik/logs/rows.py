@@ -12,8 +12,8 @@ from casadi_ik.compile.layout import Field, Layout, opaque
 from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import EventKind
 from casadi_ik.logs.traces import as_matrix, jacobian_names, measured_jacobians, words_of
+from casadi_ik.model.targets import NO_PREFERENCE, PREFERENCES
 from casadi_ik.solve.recorder import SolveBlock
-from casadi_ik.solve.request import NO_PREFERENCE, PREFERENCES
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.trace import CLEARANCE, TraceFormat
 
@@ -206,10 +206,10 @@ def solve_rows(block: SolveBlock, events: NDArray[np.int64], form: TraceFormat) 
     rows["target_points"], rows["target_normals"] = targets.points, targets.normals
     for name, vectors in targets.extra_vectors.items():
         rows[f"target_{name}"] = vectors
-    rows["start"] = block.starts
+    rows["start"] = np.nan if targets.q0 is None else targets.q0
     if targets.fixed is not None:
         is_fixed = ~np.isnan(targets.fixed)
-        rows["start"] = np.where(is_fixed, targets.fixed, block.starts)
+        rows["start"] = np.where(is_fixed, targets.fixed, rows["start"])
         padded = np.pad(is_fixed, (0, -len(is_fixed) % 32))
         rows["fixed_mask"] = words_of(padded[None]).reshape(rows["fixed_mask"].shape[1:])
     for name in ("position_tolerance", "angle_tolerance"):
@@ -239,7 +239,7 @@ def _shared_values(block: SolveBlock, layout: Layout) -> NDArray[Any]:
     row = np.zeros(1, layout.dtype)
     for name in EXTRA_ARRAY_NAMES:
         row[f"target_{name}"] = np.nan
-    row["seed"] = block.seed
+    row["seed"] = block.targets.seed
     row["limits_enforced"] = block.targets.enforce_limits
     row["prefer"] = (NO_PREFERENCE, *PREFERENCES).index(block.targets.prefer)
     rows = np.empty(len(block), layout.dtype)

@@ -23,8 +23,7 @@ from casadi_ik.logs.renamed import warn_renamed
 from casadi_ik.logs.tables import MethodRows, Table, element_name, events_of, label_of
 from casadi_ik.logs.traces import bits_of, measured_jacobians
 from casadi_ik.logs.wording import errors_text
-from casadi_ik.model.targets import Tolerance
-from casadi_ik.solve.request import NO_PREFERENCE
+from casadi_ik.model.targets import NO_PREFERENCE, Tolerance
 from casadi_ik.solve.trace import SIGMA, TraceFormat
 
 

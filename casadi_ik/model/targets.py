@@ -1,4 +1,4 @@
-"""Targets of a batch as arrays, with their tolerances."""
+"""Targets as arrays: contacts, tolerances, limits, start configurations and preference."""
 
 from __future__ import annotations
 
@@ -17,10 +17,19 @@ from casadi_ik.model.grasp import Tolerance, real_array, unit_vectors
 LIMIT_MODES = ("enforce", "ignore")
 """Treatment of joint limits: part of success, or ignored as in the paper."""
 
+Q0, CLEARANCE, MANIPULABILITY = "q0", "clearance", "manipulability"
+
+PREFERENCES = ("limits", MANIPULABILITY, Q0, CLEARANCE)
+"""Orders among solutions: distance from the limits, manipulability of the arm, distance to q0,
+clearance (requires a scene)."""
+
+NO_PREFERENCE = "none"
+"""Preference of methods that return the first solution they find."""
+
 
 @dataclass(frozen=True, eq=False)
 class TargetBatch:
-    """A batch of targets.
+    """A batch of k targets: everything that determines their solutions for a robot and a method.
 
     Attributes:
         points: (k, f, 3) contact points [m], base frame; NaN marks a free finger.
@@ -29,12 +38,15 @@ class TargetBatch:
         enforce_limits: True if a solution must be within limits.
         first_row: Number of the first target in the complete batch; with the seed it determines the
             random numbers of a target, so that a part of a batch gives the same solutions.
-        fixed: (n,) or (k, n) positions of locked actuators, NaN for free ones; None if all are
+        fixed: (n,) or (k, n) positions of fixed actuators, NaN for free ones; None if all are
             free.
         extra_vectors: (k, f, 3) arrays of contacts besides points and normals ("tangents", "lines",
             "planes", "balls"), NaN where free; arrays that are free everywhere are omitted.
         row_numbers: (k,) numbers of the targets if they are not contiguous.
-        prefer: Order among several solutions: one of `PREFERENCES`, or `NO_PREFERENCE`.
+        q0: (n,) or (k, n) start configurations [rad or m]; None: the robot's home.
+        prefer: Order among several solutions: one of `PREFERENCES`, or `NO_PREFERENCE`. "q0" refers
+            to the start configurations.
+        seed: Seed of all random numbers.
         object: Name of the grasped object, for collisions; "" if unknown.
         object_pose: (k, 4, 4) poses of the object in the base frame; None: its pose in the scene.
         palms: (k, 4, 4) palm poses, base frame; None: contacts determine them.
@@ -48,13 +60,20 @@ class TargetBatch:
     fixed: Array | None = None
     extra_vectors: Mapping[str, Array] = field(default_factory=dict)
     row_numbers: NDArray[np.intp] | None = None
+    q0: Array | None = None
     prefer: str = "limits"
+    seed: int = 0
     object: str = ""
     object_pose: Array | None = None
     palms: Array | None = None
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def prefers_q0(self) -> bool:
+        """True if solutions near the start configurations are preferred."""
+        return self.prefer == Q0
 
     @property
     def tolerances(self) -> tuple[Tolerance, ...]:
@@ -99,7 +118,10 @@ class TargetBatch:
         )
         row_numbers = None if self.row_numbers is None else self.row_numbers[rows]
         pose = None if self.object_pose is None else self.object_pose[rows]
-        fixed = self.fixed if self.fixed is None or self.fixed.ndim == 1 else self.fixed[rows]
+        fixed, q0 = (
+            array if array is None or array.ndim == 1 else array[rows]
+            for array in (self.fixed, self.q0)
+        )
         return replace(
             self,
             points=points,
@@ -109,17 +131,32 @@ class TargetBatch:
             row_numbers=row_numbers,
             object_pose=pose,
             fixed=fixed,
+            q0=q0,
             palms=None if self.palms is None else self.palms[rows],
         )
 
-    def for_fingers(self, fingers: Sequence[int]) -> TargetBatch:
-        """Return the targets of some fingers, with all motors free."""
+    def starting_at(self, q0: Array) -> TargetBatch:
+        """Return the targets with other start configurations (n,) or (k, n) [rad or m]."""
+        return replace(self, q0=q0)
+
+    def for_part(self, fingers: Sequence[int], motors: Sequence[int] | None = None) -> TargetBatch:
+        """Return the targets of a part of the robot.
+
+        Args:
+            fingers: Indices of the fingers of the part.
+            motors: Indices of its motors; None: all motors are free and start at home.
+        """
+        fixed, q0 = (
+            None if array is None or motors is None else array[..., motors]
+            for array in (self.fixed, self.q0)
+        )
         return replace(
             self,
             points=self.points[:, fingers],
             normals=self.normals[:, fingers],
             tolerance=tuple(self.tolerances[i] for i in fingers),
-            fixed=None,
+            fixed=fixed,
+            q0=q0,
             extra_vectors={name: array[:, fingers] for name, array in self.extra_vectors.items()},
         )
 
@@ -153,10 +190,17 @@ class TargetBatch:
             else np.full_like(self.points, np.nan)
         )
 
+    def starts(self, robot: RobotDescription) -> Array:
+        """Return the start configurations (k, n) [rad or m]."""
+        q0 = robot.home if self.q0 is None else self.q0
+        if q0.ndim == 2:
+            return q0
+        return q0[None] if len(self) == 1 else np.repeat(q0[None], len(self), axis=0)
+
     def bounds(self, robot: RobotDescription, unbounded: float = 1e3) -> tuple[Array, Array]:
         """Return the bounds that a method enforces: limits, or else ranges of mechanisms.
 
-        The bounds are (n,), or (k, n) if targets lock different positions.
+        The bounds are (n,), or (k, n) if targets fix actuators at different positions.
 
         Args:
             robot: The robot.
@@ -176,7 +220,7 @@ class TargetBatch:
 def fixed_array(
     fixed: Mapping[str, float], actuators: Sequence[str], lower: Array, upper: Array
 ) -> Array | None:
-    """Return locked actuators as an array for `TargetBatch.fixed`.
+    """Return the positions of fixed actuators as an array for `TargetBatch.fixed`.
 
     Args:
         fixed: Position by name of the actuator [rad or m].

@@ -131,7 +131,7 @@ class Follower:
         robot = plan.robot
         self._n, self._shape = len(robot.actuators), (len(robot.fingers), 3)
         self._point_kinds = point_normal_kinds(self._shape[0])
-        self._tolerances = self._plan_tolerances = tuple(plan.request.tolerances.values())
+        self._tolerances = self._plan_tolerances = tuple(plan.target_builder.tolerances.values())
         self._inputs_by_kinds: dict[Kinds, FollowerInputs] = {}
         self._posture = plan.posture
         self._guard = None if plan.check is None else Guard(plan)
@@ -204,7 +204,7 @@ class Follower:
             inputs.set_posture(goal)
 
     def _clipped(self, q: ArrayLike) -> Array:
-        return np.clip(self._plan.request.start(q), *self._plan.bounds)
+        return np.clip(self._plan.target_builder.start(q), *self._plan.bounds)
 
     def __call__(
         self,
@@ -307,7 +307,7 @@ class Follower:
     def _set_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
         if normals is not None:
             raise InputError("normals: found in addition to a grasp, expected None")
-        problem = self._plan.request.of_grasps([grasp], None)
+        problem = self._plan.target_builder.from_grasps([grasp])
         ((kinds, _, _),) = group_by_kinds(problem)
         if kinds != self._inputs.cycle.kinds:
             self._switch_kinds(kinds)

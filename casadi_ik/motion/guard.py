@@ -81,7 +81,7 @@ class Guard:
         for number, motors in enumerate(self._robot.side_actuators):
             self._side[list(sum(motors, ()))] = number
         anywhere = np.zeros((1, fingers, 3))
-        self._query = self._query_of(plan.request.of_arrays(anywhere, anywhere + 1.0, None))
+        self._query = self._query_of(plan.target_builder.from_arrays(anywhere, anywhere + 1.0))
         self._allocate()
 
     def set_target(self, problem: TargetBatch) -> None:

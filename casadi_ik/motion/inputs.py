@@ -18,7 +18,7 @@ from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.motion.cycle import Cycle, side_name
 from casadi_ik.motion.motion import Rates
-from casadi_ik.solve.request import Request
+from casadi_ik.solve.target_builder import TargetBuilder
 from casadi_ik.solve.verdict import deviations
 
 ERROR_TIME = 0.05
@@ -30,7 +30,7 @@ class FollowPlan:
     """Configuration of a follower.
 
     Attributes:
-        request: Robot and tolerances.
+        target_builder: Robot and tolerances.
         check: Scene of the robot; None: collisions are not checked.
         compiled: True to use compiled code.
         q0: (n,) initial positions of the motors [rad or m].
@@ -42,7 +42,7 @@ class FollowPlan:
         pull: Weight of the anchor, see `Cycle`.
     """
 
-    request: Request
+    target_builder: TargetBuilder
     check: SceneCheck | None
     compiled: bool
     q0: Array
@@ -55,8 +55,8 @@ class FollowPlan:
 
     @property
     def robot(self) -> ArmHand:
-        """Robot of the request."""
-        return self.request.robot
+        """The robot."""
+        return self.target_builder.robot
 
     @property
     def cycle_parameters(self) -> dict[str, float]:
@@ -102,7 +102,7 @@ class FollowerInputs:
         self._bounds = plan.bounds
         self._fill(lower=plan.bounds[0], upper=plan.bounds[1], posture=plan.posture)
         self._fill(max_step=max_step, max_change=max_change)
-        tolerances = tuple(plan.request.tolerances.values())
+        tolerances = tuple(plan.target_builder.tolerances.values())
         self._weights, self._tolerances = contact_weights(tolerances), tolerance_rows(tolerances)
         self._fill(**plan.cycle_parameters)
         names = "error_ratio", "goal_error_ratio"

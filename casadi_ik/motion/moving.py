@@ -25,8 +25,8 @@ from casadi_ik.motion.motion import direction_vector, length, rates_of, seconds,
 from casadi_ik.motion.reach import CarriedObject, Pace, Reach, ReachPlan, move, place, reach
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.solve.engine import Engine, SolveOptions
-from casadi_ik.solve.request import Request
 from casadi_ik.solve.solution import Chosen
+from casadi_ik.solve.target_builder import TargetBuilder
 from casadi_ik.solve.verdict import LIMIT_SLACK, judge
 
 SETTLING = 0.1
@@ -52,7 +52,7 @@ class MovingSolver:
 
     robot: ArmHand
     _engine: Engine
-    _request: Request
+    _target_builder: TargetBuilder
 
     def follow(
         self,
@@ -83,12 +83,12 @@ class MovingSolver:
             >>> follower(grasp).shape, follower.state.status.name
             ((14,), 'FOLLOWING')
         """
-        start = self._request.start(q0)
+        start = self._target_builder.start(q0)
         rates = rates_of(self.robot, velocity, acceleration)
-        free_posture = start if posture is None else self._request.start(posture, "posture")
+        free_posture = start if posture is None else self._target_builder.start(posture, "posture")
         return Follower(
             FollowPlan(
-                self._request,
+                self._target_builder,
                 self._engine.check,
                 self._engine.compiled,
                 start,
@@ -143,19 +143,22 @@ class MovingSolver:
             raise InputError("grasps: found 0 grasps, expected at least one")
         if period is None and velocity is not None:
             raise InputError("velocity: period is missing, expected both or none")
+        start = self._target_builder.start(q0)
+        targets = self._target_builder.from_grasps(
+            grasps, fixed=fixed, q0=None if q0 is None else start, seed=seed
+        )
         # Palm poses are tracked by the contacts that follow from them.
-        targets = replace(self._request.of_grasps(grasps, fixed), palms=None)
+        targets = replace(targets, palms=None)
         if targets.fixed is not None and targets.fixed.ndim > 1:
-            targets = replace(targets, fixed=self._request.fixed_vector(fixed))
-        engine, start = self._engine.engine_for(targets), self._request.start(q0)
+            targets = replace(targets, fixed=self._target_builder.fixed_vector(fixed))
+        engine = self._engine.engine_for(targets)
         _ = engine.finder
         ((kinds, _, _),) = group_by_kinds(targets.rows(slice(0, 1)))
         travel = None
         if period is not None:
             travel = rates_of(self.robot, velocity, None).steps(seconds("period", period))[0]
         tracker = PathTracker(self._path_plan(start, targets), kinds)
-        prefer = "limits" if q0 is None else "q0"
-        return track(engine, targets, start, prefer, tracker, travel, seed)
+        return track(engine, targets, tracker, travel)
 
     def reach(
         self,
@@ -213,7 +216,7 @@ class MovingSolver:
             >>> bool((found.motion.q == best.solution.q).all(axis=1).any())
             True
         """
-        start = self._request.start(q0)
+        start = self._target_builder.start(q0)
         lengths = length("lift", lift), length("retreat", retreat)
         if any(lengths) and not (
             self.robot.description.arm_actuators or self.robot.description.sides
@@ -286,14 +289,14 @@ class MovingSolver:
                 f"held: found {type(held).__name__}, expected a result of choose or grasps_of with"
                 " grasp and q"
             )
-        start, target = self._request.start(q0), single_pose(pose)
+        start, target = self._target_builder.start(q0), single_pose(pose)
         if grasp.known_pose is None:
             raise InputError("held: object_pose of the grasp is missing, expected a pose")
         self.robot.description.require_single_hand("place")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
         motion = target @ inverse(grasp.known_pose)
-        q = self._request.start(held.q, "q")
+        q = self._target_builder.start(held.q, "q")
         motors = self.robot.description.finger_motors
         hand = {name: float(q[self.robot.actuators.index(name)]) for name in motors}
         palm = Grasp(robot=grasp.robot, palm=motion @ self.robot.palm(q), posture=hand)
@@ -301,11 +304,11 @@ class MovingSolver:
         approach_plan = self._approach_plan(target_grasp, start, opening, distance, direction)
         carried_object = None
         if self._engine.check is not None:
-            held_target = self._request.of_grasps([grasp], None)
+            held_target = self._target_builder.from_grasps([grasp])
             carried_object = CarriedObject(self._engine.check, held_target, q)
         pace, height = self._pace(velocity, acceleration, period), length("lower", lower)
         plan = ReachPlan(approach_plan, pace, seed, np.clip(start, *approach_plan.plan.bounds))
-        problem = self._request.of_grasps([palm], None)
+        problem = self._target_builder.from_grasps([palm])
         solutions = self._solutions(palm, problem, start, seed, limit)
         return place(plan, *solutions, carried_object, height)
 
@@ -344,7 +347,7 @@ class MovingSolver:
             >>> found.success, bool((found.motion.q[-1] == solution.q).all())
             (True, True)
         """
-        endpoints = self._request.start(q0), self._request.start(q1, "q1")
+        endpoints = self._target_builder.start(q0), self._target_builder.start(q1, "q1")
         lower, upper = self._bounds(None)
         for name, q in zip(("q0", "q1"), endpoints, strict=True):
             excess = np.maximum(lower - q, q - upper)
@@ -397,7 +400,7 @@ class MovingSolver:
             >>> found.success, found.pregrasp.shape
             (True, (14,))
         """
-        start = self._request.start(q0)
+        start = self._target_builder.start(q0)
         plan = self._approach_plan(grasp, start, opening, distance, direction)
         return approach(plan, *self._solutions(grasp, plan.problem, start, seed, limit))
 
@@ -416,7 +419,7 @@ class MovingSolver:
     ) -> ApproachPlan:
         """Return the requirements of the approach to a grasp."""
         target: Any = grasp if isinstance(grasp, Grasp) else getattr(grasp, "grasp", grasp)
-        problem = self._request.of_grasps([target], None)
+        problem = self._target_builder.from_grasps([target])
         pregrasp_palm = target.pregrasp and target.pregrasp.single_palm
         return ApproachPlan(
             self._path_plan(start),
@@ -435,24 +438,18 @@ class MovingSolver:
         A result of `choose` has a single configuration.
         """
         if not isinstance(grasp, Grasp):
-            q = self._request.start(grasp.q, "q")
+            q = self._target_builder.start(grasp.q, "q")
             verdict = judge(self.robot, problem, q[None])
             if verdict.solved(problem.enforce_limits)[0]:
                 return [q], ""
             error = f"{1e3 * np.nanmax(verdict.position_error):.3g} mm"
             return [], f"q of the chosen grasp is not a solution (error {error}, or limits)"
-        engine = self._engine.engine_for(problem)
+        engine, problem = self._engine.engine_for(problem), replace(problem, q0=start, seed=seed)
         alternatives = engine.finder.find(
-            problem,
-            start,
-            seed,
-            limit,
-            "q0",
-            separation=0.05,
-            query=engine.collision_query(problem),
+            problem, limit, "q0", separation=0.05, query=engine.collision_query(problem)
         )
         # A solve searches longer for a collision-free solution than the list of alternatives.
-        best = engine.solve(replace(problem, prefer="q0"), SolveOptions(start, seed))
+        best = engine.solve(replace(problem, prefer="q0"), SolveOptions())
         solutions = [*best.q[best.success], *(item.q for item in alternatives)][:limit]
         return solutions, "" if solutions else "the grasp has no solution"
 
@@ -461,7 +458,7 @@ class MovingSolver:
         bounds, rates = self._bounds(targets), unbounded(self.robot)
         check, compiled = self._engine.check, self._engine.compiled
         return FollowPlan(
-            self._request, check, compiled, q0, bounds, 1.0, rates, q0, math.inf, PATH_PULL
+            self._target_builder, check, compiled, q0, bounds, 1.0, rates, q0, math.inf, PATH_PULL
         )
 
     def _bounds(self, targets: TargetBatch | None) -> tuple[Array, Array]:
@@ -478,5 +475,5 @@ class MovingSolver:
     def _placeholder_target(self, coordinate: float) -> TargetBatch:
         """Return a target with equal coordinates of all contacts; NaN frees them."""
         zeros = np.zeros((1, len(self.robot.fingers), 3))
-        target = self._request.of_arrays(zeros, zeros + 1.0, None)
+        target = self._target_builder.from_arrays(zeros, zeros + 1.0)
         return replace(target, points=zeros + coordinate)

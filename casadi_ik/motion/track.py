@@ -150,14 +150,12 @@ class Path:
     Attributes:
         engine: Engine of the hand-first method.
         targets: Grasps in order, with the same kinds of contacts.
-        seed: Seed of the starts of arms without a closed form.
         tracker: Graph of the cycles.
         query: Collision checks; None checks nothing.
     """
 
     engine: Engine
     targets: TargetBatch
-    seed: int
     tracker: PathTracker
     query: CollisionQuery | None
     _reachable: dict[int, bool] = field(default_factory=dict)
@@ -208,8 +206,7 @@ class Path:
         new = [row for row in rows.tolist() if row not in self._reachable]
         if new:
             targets = self.targets.rows(np.array(new))
-            starts = np.tile(self.engine.robot.home, (len(new), 1))
-            q = self.engine.method.run(targets, starts, self.seed, trace=False).q
+            q = self.engine.method.run(targets.starting_at(self.engine.robot.home)).q
             self._reachable |= zip(new, self.meets(np.array(new), q).tolist(), strict=True)
         return np.array([self._reachable[row] for row in rows.tolist()], dtype=bool)
 
@@ -228,7 +225,7 @@ class Path:
                 if not self._have_solutions(rows)[0]:
                     return direct_state, None
                 alternatives = self.engine.finder.find(
-                    row, previous_goal, self.seed, 1, "q0", query=self._query_at(rows)
+                    row.starting_at(previous_goal), 1, "q0", query=self._query_at(rows)
                 )
                 if not alternatives:
                     return direct_state, None
@@ -252,21 +249,15 @@ class Path:
         leaps = np.flatnonzero(self._relative_motion(np.diff(goals, axis=0)) > TRACK_TUNING.leap)
         return goals[-1], goals[leaps[0]] if len(leaps) else None
 
-    def starts(self, q0: Array, prefer: str) -> Iterator[Array]:
+    def starts(self, prefer: str) -> Iterator[Array]:
         """Yield solutions of the first grasp, beginning with the result of a fast solve."""
         engine, row, first = self.engine, np.zeros(1, dtype=np.intp), self._row(0)
-        run = engine.method.run(replace(first, prefer=prefer), q0[None], self.seed, trace=False)
+        run = engine.method.run(replace(first, prefer=prefer))
         is_solved = bool(self.meets(row, run.q)[0])
         if is_solved:
             yield run.q[0]
         alternatives = engine.finder.find(
-            first,
-            q0,
-            self.seed,
-            TRACK_TUNING.starts,
-            prefer,
-            separation=0,
-            query=self._query_at(row),
+            first, TRACK_TUNING.starts, prefer, separation=0, query=self._query_at(row)
         )
         yield from (alternative.q for alternative in alternatives)
         if not (alternatives or is_solved):
@@ -340,11 +331,8 @@ class Track:
 def track(
     engine: Engine,
     targets: TargetBatch,
-    q0: Array,
-    prefer: str,
     tracker: PathTracker,
     travel: Array | None,
-    seed: int,
 ) -> Track:
     """Track k grasps with the same kinds of contacts.
 
@@ -353,23 +341,20 @@ def track(
 
     Args:
         engine: Engine of the hand-first method for the kinds of contacts.
-        targets: Grasps in order.
-        q0: (n,) positions of the motors.
-        prefer: Preference among solutions of the first grasp, see `PREFERENCES`.
+        targets: Grasps in order; starts and preference apply to the first one.
         tracker: Graph of the cycles.
         travel: (n,) largest motion of every motor from one grasp to the next; motors that are too
             slow lag behind. None: any distance.
-        seed: Seed of the starts of arms without a closed form.
 
     Raises:
         UnsupportedError: The method is not hand-first.
     """
     start_time, all_rows = time.perf_counter(), np.arange(len(targets))
     query = engine.collision_query(targets)
-    path = Path(engine, targets, seed, tracker, query)
+    path = Path(engine, replace(targets, prefer="limits"), tracker, query)
     best: tuple[Array, list[Jump]] | None = None
     best_counts = (np.inf, np.inf)
-    for start in path.starts(q0, prefer):
+    for start in path.starts(targets.prefer):
         q, jumps = path.follow(start)
         missed = int((~path.meets(all_rows, q)).sum())
         if query is not None and not missed:

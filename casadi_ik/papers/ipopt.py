@@ -32,6 +32,7 @@ from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, point_norm
 from casadi_ik.kinematics.couplings import joint_positions
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.limits import clip_starts
 from casadi_ik.solve.method import Method, Outcome
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import (
@@ -474,19 +475,19 @@ class IpoptMethod(Method):
         """Parameter record as a mapping."""
         return dataclasses.asdict(self.options)
 
-    def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
+    def stepper(self, targets: TargetBatch) -> Stepper:
         """Raise, because this method has no step graph.
 
         Raises:
             UnsupportedError: Always.
         """
-        del targets, q0
+        del targets
         raise UnsupportedError(
             f"method {self.name!r} cannot be stepped by hand: Ipopt runs its iterations itself and "
             "only reports them; a log holds them all"
         )
 
-    def run(self, targets: TargetBatch, q0: Array, seed: int, trace: bool) -> Outcome:
+    def run(self, targets: TargetBatch, trace: bool = False) -> Outcome:
         """Solve a batch; see `Method.run`.
 
         The random numbers of a target are those of the seed and the target's number in the whole
@@ -498,10 +499,10 @@ class IpoptMethod(Method):
         elapsed = np.zeros(count)
         traces = [np.zeros(0, self.record.dtype)]
         goals = self._goals(targets)
-        starts = np.clip(q0, robot.lower, robot.upper) if targets.enforce_limits else q0
+        starts = clip_starts(robot, targets)
         for row in range(count):
             begin = time.perf_counter()
-            sequence = np.random.SeedSequence([seed, targets.row_number(row)])
+            sequence = np.random.SeedSequence([targets.seed, targets.row_number(row)])
             runs = self._runs(starts[row], goals[row], targets, np.random.default_rng(sequence))
             best = min(runs, key=lambda run: run.cost)
             q[row] = best.q

@@ -22,7 +22,7 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contact_batches import group_by_kinds
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse, transform_arrays
-from casadi_ik.model.targets import TargetBatch
+from casadi_ik.model.targets import CLEARANCE, TargetBatch
 from casadi_ik.solve.alternatives import (
     ALTERNATIVES,
     DEFAULT_SEPARATION,
@@ -34,10 +34,10 @@ from casadi_ik.solve.batches import judge_outcome
 from casadi_ik.solve.collision_free import find_collision_free
 from casadi_ik.solve.engine import Engine
 from casadi_ik.solve.method import Outcome
-from casadi_ik.solve.request import CLEARANCE, Request
 from casadi_ik.solve.row_selection import Deduplicator, largest_per_owner
 from casadi_ik.solve.solution import Choice, Ranking, Solution
 from casadi_ik.solve.status import Status
+from casadi_ik.solve.target_builder import TargetBuilder
 from casadi_ik.solve.turns import in_nearest_turns, nearest_turns, search_start
 
 RankingPreference: TypeAlias = str | Callable[[ArmHand, Array], ArrayLike]
@@ -161,18 +161,18 @@ def choose(
     """
     begin = time.perf_counter()
     engine: Engine = solver._engine
-    request: Request = solver._request
+    builder: TargetBuilder = solver._target_builder
     grasps = _candidates(grasps)
     limit = _positive_count(limit, "limit")
     max_per_candidate = limit
     if per_candidate is not None:
         max_per_candidate = _positive_count(per_candidate, "per_candidate")
-    apart, start = check_separation(apart), request.start(q0)
-    name = "own" if callable(prefer) else engine.resolve_preference(prefer, q0 is not None)
+    apart, start = check_separation(apart), builder.start(q0)
+    name = "own" if callable(prefer) else builder.preference(prefer, q0 is not None)
     pose = None if object_pose is None else single_pose(object_pose, "object_pose")
     preference: Preference = _checked_scores(prefer, engine.robot) if callable(prefer) else name
-    groups = list(_target_groups(request, grasps, pose, fixed))
-    search = _Search(engine, groups, start, preference, limit, seed)
+    groups = list(_target_groups(builder, grasps, pose, fixed, seed))
+    search = _Search(engine, groups, start, preference, limit)
     parts = list(search.solve(np.ones(len(grasps), dtype=bool), thorough=False))
     solutions = CandidateSolutions.concatenate(parts, len(grasps))
     best = search.best(solutions, apart, max_per_candidate)
@@ -247,10 +247,11 @@ def _checked_scores(
 
 
 def _target_groups(
-    request: Request,
+    builder: TargetBuilder,
     grasps: Sequence[Grasp],
     pose: Array | None,
     fixed: Mapping[str, float] | None,
+    seed: int,
 ) -> Iterator[tuple[NDArray[np.intp], TargetBatch]]:
     """Yield groups of candidates with equal fingers, tolerances, contact kinds and object.
 
@@ -272,7 +273,7 @@ def _target_groups(
     for numbers in groups.values():
         group = [grasps[number] for number in numbers]
         indices = np.array(numbers, dtype=np.intp)
-        targets = _with_object_pose(request.of_grasps(group, fixed), group, pose)
+        targets = _with_object_pose(builder.from_grasps(group, fixed=fixed, seed=seed), group, pose)
         for _, kind_rows, kind_targets in group_by_kinds(targets):
             yield indices[kind_rows], kind_targets
 
@@ -319,7 +320,6 @@ class _Search:
         start: (n,) initial configuration, the reference of the preference "q0".
         prefer: The preference.
         limit: Number of solutions to return.
-        seed: Seed of random arms.
     """
 
     engine: Engine
@@ -327,7 +327,6 @@ class _Search:
     start: Array
     prefer: Preference
     limit: int
-    seed: int
 
     def solve(
         self, is_selected: Bools, thorough: bool
@@ -400,7 +399,8 @@ class _Search:
             status = np.full(len(group_rows), int(Status.SOLVED), dtype=np.int64)
             robot = self.engine.robot.description
             with_preference = replace(group, prefer="q0" if self.prefer == "q0" else "limits")
-            q = in_nearest_turns(robot, with_preference, solutions.q[group_rows], self.start)
+            with_preference = with_preference.starting_at(self.start)
+            q = in_nearest_turns(robot, with_preference, solutions.q[group_rows])
             outcome = Outcome(q, status, zeros, zeros, np.zeros(len(group_rows)), {})
             query, method = self.engine.collision_query(group), self.engine.method.name
             batch = judge_outcome(self.engine.robot, method, group, outcome, query)
@@ -431,7 +431,7 @@ class _CandidateChunk:
         """Return the solutions, see `_Search.solve`."""
         method = self.subproblems.method
         restarts = CHOOSE_PARAMETERS.max_restarts if thorough else 1
-        outcome = method.run(self.targets, self.home, self.search.seed, False, restarts)
+        outcome = method.run(self.targets, rounds=restarts)
         solved = self.subproblems.solved(self.targets, outcome.q, self.targets.enforce_limits)
         reasons = np.array([Status(int(code)).name for code in outcome.status], dtype=object)
         # A method's SOLVED that fails the check becomes STALLED.
@@ -469,8 +469,6 @@ class _CandidateChunk:
             self.targets.rows(rows),
             query.rows(rows),
             q,
-            self.home[rows],
-            self.search.seed,
             diagnose=False,
         )
         reports = zip(rows.tolist(), result.reports, strict=True)
@@ -490,8 +488,8 @@ class _CandidateChunk:
         if not len(rows) or self.targets.palms is not None:
             return q, rows  # A target with a palm pose has a single hand posture.
         postures = self.subproblems.method.postures(self.targets.rows(rows), 0)
-        starts = self.limits.clip(self.home)
-        candidate, *initial = self.subproblems.hand_rows(self.targets, rows, starts, postures)
+        targets = self.targets.starting_at(self.limits.clip(self.home))
+        candidate, *initial = self.subproblems.hand_rows(targets, rows, postures)
         refined_q, targets = self.subproblems.run(*initial), self.targets.rows(candidate)
         refined_q[~self.subproblems.solved(targets, refined_q, targets.enforce_limits)] = np.nan
         solutions = np.concatenate(

@@ -14,6 +14,7 @@ import numpy as np
 
 from casadi_ik.files.arrays import Array, Counts, spread_points
 from casadi_ik.files.reading import Frame, frame_matrix
+from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.pose import Free
 from casadi_ik.model.targets import TargetBatch
@@ -72,6 +73,7 @@ def place_targets(targets: TargetBatch, poses: Array) -> TargetBatch:
         fixed=fixed if fixed is None or fixed.ndim == 1 else fixed[0],
         palms=None if targets.palms is None else poses @ targets.palms[0],
         object_pose=poses if targets.object else None,
+        q0=targets.q0 if targets.q0 is None or targets.q0.ndim == 1 else targets.q0[0],
     )
 
 
@@ -119,8 +121,7 @@ def solve_with_object(
     prove: Prove,
     targets: TargetBatch,
     free: Free,
-    start: Array,
-    ranges: Array,
+    robot: ArmHand,
 ) -> Solution:
     """Solve a grasp at the preferred object pose among several attempts.
 
@@ -130,13 +131,13 @@ def solve_with_object(
         prove: Searches for proofs.
         targets: One target, in the object frame.
         free: Bounds of the object pose.
-        start: (n,) initial configuration.
-        ranges: (n,) ranges of the motors.
+        robot: The robot.
 
     Returns:
-        The solved pose nearest to `start` if the preference is "q0", else the solved pose nearest
-        to the center of the bounds. Without a solution: the central pose with its diagnosis, which
-        is `Status.UNREACHABLE` only if a proof covers all poses within the bounds.
+        The solved pose whose configuration is nearest to q0 if the preference is "q0", else the
+        solved pose nearest to the center of the bounds. Without a solution: the central pose with
+        its diagnosis, which is `Status.UNREACHABLE` only if a proof covers all poses within the
+        bounds.
     """
     poses, first = poses_within(free, sum(POSE_BATCHES)), 0
     span = np.maximum(np.asarray(free.upper) - np.asarray(free.lower), 1e-12)
@@ -147,8 +148,9 @@ def solve_with_object(
         batch = screen(batch_targets) if first else solve(batch_targets, False)
         solved = np.flatnonzero(batch.status == Status.SOLVED)
         if len(solved):
-            if targets.prefer == "q0":
-                distance = np.abs((batch.q[solved] - start) / ranges).max(axis=1)
+            if targets.prefers_q0:
+                travel = batch.q[solved] - targets.starts(robot.description)
+                distance = np.abs(travel / (robot.upper - robot.lower)).max(axis=1)
             else:
                 distance = np.linalg.norm(offsets[rows[solved]] * (span > 1e-9), axis=1)
             best = int(solved[np.argmin(distance)])

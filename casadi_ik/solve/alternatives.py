@@ -18,12 +18,11 @@ from casadi_ik.kinematics.forward import actuated
 from casadi_ik.kinematics.linear_algebra import manipulability
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import Tolerance
-from casadi_ik.model.targets import TargetBatch
+from casadi_ik.model.targets import CLEARANCE, TargetBatch
 from casadi_ik.solve.arm_branches import ArmBranches
 from casadi_ik.solve.arm_search import ArmSearch, Preference
 from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
 from casadi_ik.solve.method import HandSearch
-from casadi_ik.solve.request import CLEARANCE, resolve_preference
 from casadi_ik.solve.row_selection import distinct_rows
 from casadi_ik.solve.solution import Alternative, ArmBranch
 from casadi_ik.solve.subproblems import (
@@ -34,7 +33,8 @@ from casadi_ik.solve.subproblems import (
     sample_trunks,
     side_palms,
 )
-from casadi_ik.solve.turns import nearest_turns, search_start
+from casadi_ik.solve.target_builder import resolve_preference
+from casadi_ik.solve.turns import nearest_turns, with_search_starts
 from casadi_ik.solve.verdict import contact_verdicts, judge
 
 DEFAULT_SEPARATION = 0.25
@@ -143,8 +143,6 @@ class AlternativeFinder:
     def find(
         self,
         targets: TargetBatch,
-        q0: Array,
-        seed: int,
         limit: int,
         prefer: str,
         separation: float = DEFAULT_SEPARATION,
@@ -156,8 +154,6 @@ class AlternativeFinder:
 
         Args:
             targets: One target.
-            q0: (n,) initial configuration.
-            seed: Seed of the starts of arms without a closed form.
             limit: Maximum number of solutions.
             prefer: One of `PREFERENCES`.
             separation: Minimum difference of two solutions: at least one motor differs by this
@@ -173,11 +169,13 @@ class AlternativeFinder:
         resolve_preference(prefer, has_start=True)
         separation = check_separation(separation)
         limits = self.subproblems.limits(targets).first
-        robot, bounds, start = self.robot.description, (limits.lower, limits.upper), q0
-        q0 = search_start(robot, start)
+        robot, bounds = self.robot.description, (limits.lower, limits.upper)
+        (start,) = targets.starts(robot)
+        targets = with_search_starts(robot, targets)
+        (q0,) = targets.starts(robot)
         candidates: list[_Candidate] = []
-        for number, q in enumerate(self._postures(targets, q0, limits)):
-            candidates += self._arm_candidates(targets, q, number, limits, q0, seed, prefer, query)
+        for number, q in enumerate(self._postures(targets, limits)):
+            candidates += self._arm_candidates(targets, q, number, limits, prefer, query)
         if not candidates:
             return ()
         q = np.stack([candidate.q for candidate in candidates])
@@ -198,30 +196,30 @@ class AlternativeFinder:
         distinct_candidates = [replace(candidates[order[i]], q=q[order[i]]) for i in rows]
         return tuple(self._describe(targets, candidate, start) for candidate in distinct_candidates)
 
-    def best_arm(self, targets: TargetBatch, q: Array, q0: Array, seed: int, prefer: str) -> Array:
+    def best_arm(self, targets: TargetBatch, q: Array, prefer: str) -> Array:
         """Return the solution (n,) with the best arm for the hand of a solution.
 
         Args:
             targets: One target.
             q: (n,) solution.
-            q0: (n,) initial configuration.
-            seed: Seed of the starts of arms without a closed form.
             prefer: One of `PREFERENCES`.
         """
         limits = self.subproblems.limits(targets).first
-        candidates = self._arm_candidates(targets, q, 0, limits, q0, seed, prefer)
+        candidates = self._arm_candidates(targets, q, 0, limits, prefer)
         solutions = np.stack([q, *(candidate.q for candidate in candidates)])
         solved = self.subproblems.solved(targets, solutions, targets.enforce_limits)
         solutions = solutions[solved] if solved.any() else q[None]
+        (q0,) = targets.starts(self.robot.description)
         return solutions[int(np.argmax(self.score(solutions, q0, prefer)))]
 
-    def _postures(self, targets: TargetBatch, q0: Array, limits: Bounds) -> list[Array]:
+    def _postures(self, targets: TargetBatch, limits: Bounds) -> list[Array]:
         """Return solutions (n,) with different hands, from all candidates of all restarts."""
         subproblems, method = self.subproblems, self.subproblems.method
         restarts = range(method.options.rounds)
         postures = np.concatenate([method.postures(targets, restart)[0] for restart in restarts])
-        start, target_rows = limits.clip(q0)[None], np.zeros(1, dtype=np.intp)
-        _, states, parameters = subproblems.hand_rows(targets, target_rows, start, postures[None])
+        clipped = targets.starting_at(limits.clip(targets.starts(self.robot.description)))
+        target_rows = np.zeros(1, dtype=np.intp)
+        _, states, parameters = subproblems.hand_rows(clipped, target_rows, postures[None])
         original_parameters = parameters.copy()
         subproblems.set_tolerance(parameters, ALTERNATIVES.tight_tolerance)
         q = subproblems.run(states, parameters)
@@ -234,7 +232,7 @@ class AlternativeFinder:
             solutions = q[subproblems.solved(targets, q, targets.enforce_limits)]
         if not len(solutions):
             # The complete search also uses seeds that are not in the tables.
-            q = method.run(targets, q0[None], 0, trace=False).q
+            q = method.run(targets).q
             solutions = q[subproblems.solved(targets, q, targets.enforce_limits)]
         rows = distinct_rows(self.hand_coordinates(solutions), ALTERNATIVES.min_difference)
         return [solutions[i] for i in rows]
@@ -261,8 +259,6 @@ class AlternativeFinder:
         q: Array,
         posture: int,
         limits: Bounds,
-        q0: Array,
-        seed: int,
         prefer: str,
         query: CollisionQuery | None = None,
     ) -> list[_Candidate]:
@@ -276,11 +272,12 @@ class AlternativeFinder:
             return [_Candidate(q, posture)]
 
         def iterative_candidates() -> list[_Candidate]:
-            arms = self._search_arms(targets, q, seed, q0, prefer)
+            arms = self._search_arms(targets, q, prefer)
             return [_Candidate(arm, posture) for arm in arms]
 
         if self._arm_branches is None:
             return iterative_candidates()
+        (q0,) = targets.starts(self.robot.description)
         palm = self.robot.palm(q)
         bounds = (
             self._closed_form_bounds(limits.lower, limits),
@@ -342,19 +339,16 @@ class AlternativeFinder:
         fractions = self._range_fractions(solutions, moving)
         return [solutions[i] for i in distinct_rows(fractions, ALTERNATIVES.min_difference)]
 
-    def _search_arms(
-        self, targets: TargetBatch, q: Array, seed: int, q0: Array, prefer: str
-    ) -> list[Array]:
+    def _search_arms(self, targets: TargetBatch, q: Array, prefer: str) -> list[Array]:
         """Return solutions with different arms, refined from every branch and from random arms."""
-        starts = self.robot.random(np.random.default_rng(seed), ALTERNATIVES.random_arms)
+        starts = self.robot.random(np.random.default_rng(targets.seed), ALTERNATIVES.random_arms)
         starts[:, self.hand] = q[self.hand]
         if self._arm_branches is None and self.arm_search is not None:
             limits, no_bound = self.subproblems.limits(targets).first, np.full(1, np.inf)
             bounds = limits.lower, limits.upper
             preference = "limits" if prefer == CLEARANCE else prefer
-            arms = self.arm_search.choose(
-                q[None], q0[None], bounds, preference, None, no_bound, True
-            )
+            q0 = targets.starts(self.robot.description)
+            arms = self.arm_search.choose(q[None], q0, bounds, preference, None, no_bound, True)
             starts = np.concatenate([arms.q, starts])
         starts = np.concatenate([q[None], starts])
         configurations = LocalRefinement(self.subproblems, targets).run(

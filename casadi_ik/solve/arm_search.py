@@ -27,7 +27,7 @@ from casadi_ik.files.arrays import Array, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
-from casadi_ik.solve.request import CLEARANCE
+from casadi_ik.model.targets import CLEARANCE
 
 SYMBOL = "casadi_ik_arm_search"
 

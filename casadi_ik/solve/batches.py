@@ -13,7 +13,6 @@ import numpy as np
 
 from casadi_ik.collision.clearance import CollisionQuery
 from casadi_ik.compile.cancellation import cancellable, stop_if_cancelled
-from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.method import Outcome
@@ -30,7 +29,6 @@ class SolvedPart:
 
     Attributes:
         targets: Targets of the part.
-        starts: (k, n) start configurations [rad or m].
         started: Start time [ns since the Unix epoch].
         outcome: Result of the method.
         batch: Solutions after the verdict.
@@ -38,13 +36,12 @@ class SolvedPart:
     """
 
     targets: TargetBatch
-    starts: Array
     started: int
     outcome: Outcome
     batch: BatchSolution
     query: CollisionQuery | None = None
 
-    def record(self, recorder: Recorder, trace_format: TraceFormat, seed: int) -> None:
+    def record(self, recorder: Recorder, trace_format: TraceFormat) -> None:
         """Pass the part to a recorder if its iterations were traced."""
         if self.outcome.rows is None:
             return
@@ -54,8 +51,6 @@ class SolvedPart:
             format=trace_format,
             first=self.targets.first_row,
             targets=self.targets,
-            starts=self.starts,
-            seed=seed,
             batch=batch,
             rows=self.outcome.rows,
             started=self.started + (before * 1e9).astype(np.int64),

@@ -247,17 +247,16 @@ class FloatingPalmFit:
             evidence.append((hand, arm))
         return evidence
 
-    def fit(self, targets: TargetBatch, q0: Array) -> HandFits:
+    def fit(self, targets: TargetBatch) -> HandFits:
         """Fit a few seeds to each of k targets, and more seeds if the arm reaches none of the fits.
 
         Args:
-            targets: The targets.
-            q0: (k, n) positions of unconstrained motors [rad or m].
+            targets: The targets; unconstrained motors stay at their start.
         """
         method, all_targets = self._subproblems.method, np.arange(len(targets))
         nearest = method.postures(targets, 0)
         hand_fits = self._fit_seeds(
-            targets, q0, all_targets, nearest[:, : CLOSEST_SETTINGS.first_seeds]
+            targets, all_targets, nearest[:, : CLOSEST_SETTINGS.first_seeds]
         )
         unreached = hand_fits.unreached_targets()
         if len(unreached):
@@ -266,7 +265,7 @@ class FloatingPalmFit:
                 [nearest[unreached, CLOSEST_SETTINGS.first_seeds :], further], axis=1
             )
             hand_fits = HandFits.concatenate(
-                [hand_fits, self._fit_seeds(targets, q0, unreached, seeds)]
+                [hand_fits, self._fit_seeds(targets, unreached, seeds)]
             )
         rows = np.flatnonzero(
             hand_fits.ok & np.isin(hand_fits.owner, hand_fits.unreached_targets())
@@ -282,12 +281,10 @@ class FloatingPalmFit:
             )
         return hand_fits
 
-    def _fit_seeds(
-        self, targets: TargetBatch, q0: Array, target_rows: Rows, postures: Array
-    ) -> HandFits:
+    def _fit_seeds(self, targets: TargetBatch, target_rows: Rows, postures: Array) -> HandFits:
         """Fit seeds (c, p, hand) to the selected targets (c,)."""
         subproblems = self._subproblems
-        owner, states, parameters = subproblems.hand_rows(targets, target_rows, q0, postures)
+        owner, states, parameters = subproblems.hand_rows(targets, target_rows, postures)
         parameters[:, subproblems.parameters.slice("hand_only")] = 1.0
         parameters[:, subproblems.parameters.slice("reach_weight")] = 0.0
         return self._run(targets, owner, states, parameters)

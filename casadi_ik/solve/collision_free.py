@@ -11,13 +11,12 @@ import numpy as np
 from casadi_ik.collision.clearance import Clearances, CollisionQuery
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.contact_batches import group_by_kinds
-from casadi_ik.model.targets import TargetBatch
+from casadi_ik.model.targets import CLEARANCE, MANIPULABILITY, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
 from casadi_ik.solve.batches import judge_outcome
 from casadi_ik.solve.collision_free_parameters import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.collision_free_search import CollisionFreeResult, CollisionFreeSearch
 from casadi_ik.solve.method import Outcome
-from casadi_ik.solve.request import CLEARANCE
 from casadi_ik.solve.solution import BatchSolution
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.verdict import SolvedVerdict, judge_single
@@ -25,7 +24,7 @@ from casadi_ik.solve.verdict import SolvedVerdict, judge_single
 DEFAULT_PREFERENCE = "limits"
 """Preference of targets that specify none."""
 
-RANKING_PREFERENCES = ("manipulability", CLEARANCE)
+RANKING_PREFERENCES = (MANIPULABILITY, CLEARANCE)
 """Preferences that rank even collision-free solutions against all other candidates."""
 
 
@@ -34,8 +33,6 @@ def find_collision_free(
     targets: TargetBatch,
     query: CollisionQuery,
     q: Array,
-    starts: Array,
-    seed: int,
     rank_all: bool = False,
     diagnose: bool = True,
 ) -> CollisionFreeResult:
@@ -46,33 +43,27 @@ def find_collision_free(
         targets: k targets.
         query: Pairs that must not collide.
         q: (k, n) solutions, which may collide.
-        starts: (k, n) initial configurations.
-        seed: Seed of the random steps and arms.
         rank_all: Rank solutions without a collision against all other candidates by the
             preference, instead of returning them.
         diagnose: Check for targets without a result whether they are solvable without the scene,
             or without self-collision.
     """
-    home = np.tile(finder.robot.home, (len(q), 1))
-    is_biased = targets.prefer != DEFAULT_PREFERENCE or not np.array_equal(starts, home)
-    result = _search_in_chunks(
-        finder, targets, query, q, starts, seed, rank_all, diagnose, escape=not is_biased
-    )
+    home = finder.robot.home
+    starts_at_home = (targets.starts(finder.robot.description) == home).all()
+    is_biased = targets.prefer != DEFAULT_PREFERENCE or not starts_at_home
+    result = _search_in_chunks(finder, targets, query, q, rank_all, diagnose, escape=not is_biased)
     blocked = np.flatnonzero(~result.free)
     if not is_biased or not len(blocked):
         return result
     # A preference ranks solutions and must not decide whether one exists. Escape steps lead to
     # arbitrary solutions, so a second search takes them, without a preference and from home.
-    retry, subproblems = (
-        replace(targets.rows(blocked), prefer=DEFAULT_PREFERENCE),
-        finder.subproblems,
-    )
-    retry_q = subproblems.method.run(retry, home[blocked], seed, False).q
+    retry = replace(targets.rows(blocked), prefer=DEFAULT_PREFERENCE, q0=home)
+    subproblems = finder.subproblems
+    retry_q = subproblems.method.run(retry).q
     solved = subproblems.solved(retry, retry_q, retry.enforce_limits)
     blocked, retry, retry_q = blocked[solved], retry.rows(np.flatnonzero(solved)), retry_q[solved]
-    arguments = query.rows(blocked), retry_q, home[blocked]
     second = _search_in_chunks(
-        finder, retry, *arguments, seed, rank_all=False, diagnose=False, escape=True
+        finder, retry, query.rows(blocked), retry_q, rank_all=False, diagnose=False, escape=True
     )
     freed_rows = blocked[second.free]
     result.q[freed_rows], result.free[freed_rows], result.reports[freed_rows] = (
@@ -88,8 +79,6 @@ def _search_in_chunks(
     targets: TargetBatch,
     query: CollisionQuery,
     q: Array,
-    starts: Array,
-    seed: int,
     rank_all: bool,
     diagnose: bool,
     escape: bool,
@@ -100,8 +89,7 @@ def _search_in_chunks(
     results = []
     for first_row in range(0, len(q), COLLISION_FREE_PARAMETERS.chunk_size):
         rows = np.arange(first_row, min(first_row + COLLISION_FREE_PARAMETERS.chunk_size, len(q)))
-        chunk = targets.rows(rows), query.rows(rows), starts[rows]
-        search = CollisionFreeSearch(finder, *chunk, seed)
+        search = CollisionFreeSearch(finder, targets.rows(rows), query.rows(rows))
         if rank_all:
             search.record_candidates(q[rows], np.arange(len(rows)))
         search.run(q[rows], rank_all, escape)
@@ -114,8 +102,6 @@ def resolve_collisions(
     finder_of: Callable[[TargetBatch], AlternativeFinder],
     targets: TargetBatch,
     query: CollisionQuery,
-    starts: Array,
-    seed: int,
     outcome: Outcome,
     batch: BatchSolution,
     diagnose: bool = True,
@@ -126,8 +112,6 @@ def resolve_collisions(
         finder_of: Function that returns the finder for a combination of contact kinds.
         targets: k targets.
         query: Pairs that must not collide.
-        starts: (k, n) initial configurations.
-        seed: Seed of all random numbers.
         outcome: Outcome of the method.
         batch: Verdicts on the outcome.
         diagnose: Determine the reasons of collisions, see `find_collision_free`.
@@ -153,8 +137,6 @@ def resolve_collisions(
             kind_targets,
             query.rows(target_rows),
             q[target_rows],
-            starts[target_rows],
-            seed,
             rank_all,
             diagnose,
         )
@@ -175,7 +157,6 @@ def resolve_single(
     targets: TargetBatch,
     query: CollisionQuery,
     q: Array,
-    start: Array,
     try_other_hands: bool = False,
 ) -> tuple[Array, SolvedVerdict, Clearances] | None:
     """Return a collision-free configuration with the hand of a single solution.
@@ -187,13 +168,12 @@ def resolve_single(
         targets: One target.
         query: Pairs that must not collide.
         q: (n,) solution in collision.
-        start: (n,) initial configuration.
         try_other_hands: Try the hands of restarts too, like an exported solver.
 
     Returns:
         The configuration, its verdict and its clearance; None if a full search is needed.
     """
-    search = CollisionFreeSearch(finder, targets, query, start[None], 0)
+    search = CollisionFreeSearch(finder, targets, query)
     search.try_hands(q[None], np.zeros(1, dtype=np.intp))
     if try_other_hands:
         for hands, target_index in search.restart_hands():

@@ -30,13 +30,12 @@ from numpy.typing import NDArray
 from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
 from casadi_ik.collision.distances import PairTable
 from casadi_ik.files.arrays import Array
-from casadi_ik.model.targets import TargetBatch
+from casadi_ik.model.targets import CLEARANCE, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder, side_links
 from casadi_ik.solve.arm_search import Preference
 from casadi_ik.solve.collision_free_parameters import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.free_hands import SideHands, UnconstrainedFingers
 from casadi_ik.solve.random_steps import RandomSteps
-from casadi_ik.solve.request import CLEARANCE
 from casadi_ik.solve.row_selection import Deduplicator, improving_rows, largest_per_owner
 from casadi_ik.solve.solution import CollisionReport
 from casadi_ik.solve.subproblems import sample_trunks
@@ -73,17 +72,15 @@ class CollisionFreeSearch:
         finder: AlternativeFinder,
         targets: TargetBatch,
         query: CollisionQuery,
-        starts: Array,
-        seed: int,
     ) -> None:
         """Prepare a search without candidates, see `find_collision_free`."""
         self.finder, self.arm_search = finder, finder.arm_search
         self.targets, self.query = targets, query
-        self.starts = starts
+        self.starts = targets.starts(finder.robot.description)
         self.subproblems = finder.subproblems
-        self._steps = RandomSteps(self.subproblems, targets, seed)
+        self._steps = RandomSteps(self.subproblems, targets)
         self.limits = self.subproblems.limits(targets)
-        count, n = starts.shape
+        count, n = self.starts.shape
         self.best, self.score = np.full((count, n), np.nan), np.full(count, -np.inf)
         self.least_penetrating, self.surplus = np.full((count, n), np.nan), np.full(count, -np.inf)
         self.free = np.zeros(count, dtype=bool)
@@ -306,10 +303,9 @@ class CollisionFreeSearch:
                 break
             self._has_new_hands[:] = False
             postures = method.postures(self.targets.rows(rows), restart)
-            first_palm, starts = restart * postures.shape[1], self.limits.clip(self.starts)
-            target_index, *initial = self.subproblems.hand_rows(
-                self.targets, rows, starts, postures, first_palm
-            )
+            first_palm = restart * postures.shape[1]
+            targets = self.targets.starting_at(self.limits.clip(self.starts))
+            target_index, *initial = self.subproblems.hand_rows(targets, rows, postures, first_palm)
             yield self._steps.select_solved(self.subproblems.run(*initial), target_index)
 
     def _solve_from_random_arms(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:

@@ -98,19 +98,18 @@ class Diagnostician:
             for side in robot.description.sides
         ]
 
-    def diagnose(self, targets: TargetBatch, q0: Array, nearest: Array | None) -> list[Diagnosis]:
+    def diagnose(self, targets: TargetBatch, nearest: Array | None) -> list[Diagnosis]:
         """Diagnose k targets independently of each other.
 
         Args:
             targets: The targets.
-            q0: (k, n) start configurations [rad or m].
             nearest: (k, n) configurations that hand-first returned [rad or m]; None: run it.
         """
         self.method.prepare()
         if targets.fixed is not None and targets.fixed.ndim > 1:
             # Targets with different fixed positions are diagnosed one by one.
             diagnoses = [
-                self.diagnose(_single_fixed(targets, row), q0[row : row + 1], nearest_of_row)[0]
+                self.diagnose(_single_fixed(targets, row), nearest_of_row)[0]
                 for row in range(len(targets))
                 for nearest_of_row in [None if nearest is None else nearest[row : row + 1]]
             ]
@@ -118,7 +117,7 @@ class Diagnostician:
         is_solved = np.zeros(len(targets), dtype=bool)
         clock = _Clock(np.zeros(len(targets)))
         if nearest is None:
-            nearest = self.method.run(targets, q0, 0, trace=False).q
+            nearest = self.method.run(targets).q
             is_solved = judge(self.robot, targets, nearest).solved(targets.enforce_limits)
             clock.lap(np.arange(len(targets)))
         by_row: dict[int, Diagnosis] = {}
@@ -130,19 +129,17 @@ class Diagnostician:
         for start in range(0, len(unsolved), DIAGNOSIS_EFFORT.batch_size):
             rows = unsolved[start : start + DIAGNOSIS_EFFORT.batch_size]
             clock_of_rows = _Clock(clock.seconds[rows])
-            diagnoses = self._diagnose_unsolved(
-                targets.rows(rows), q0[rows], nearest[rows], clock_of_rows
-            )
+            diagnoses = self._diagnose_unsolved(targets.rows(rows), nearest[rows], clock_of_rows)
             by_row |= zip(rows.tolist(), diagnoses, strict=True)
         return [by_row[row] for row in range(len(targets))]
 
     def _diagnose_unsolved(
-        self, targets: TargetBatch, q0: Array, nearest: Array, clock: _Clock
+        self, targets: TargetBatch, nearest: Array, clock: _Clock
     ) -> Iterator[Diagnosis]:
         """Yield the diagnoses of targets that hand-first did not solve."""
         all_rows = np.arange(len(targets))
         refinement = LocalRefinement(self._subproblems, targets)
-        evidence, hand_fits = self._fit_hands(targets, q0)
+        evidence, hand_fits = self._fit_hands(targets)
         owner, configurations = self._place_arms(hand_fits)
         owner, configurations = (
             np.concatenate([all_rows, owner]),
@@ -196,9 +193,7 @@ class Diagnostician:
                 continue
             hand, reach = evidence[i]
             target, hand_only = targets.rows(slice(i, i + 1)), causes[i] is Reason.HAND
-            remedies = RemedyFinder(
-                self._subproblems, target, q0[i], best.q[i], may_block[i], hand_only
-            )
+            remedies = RemedyFinder(self._subproblems, target, best.q[i], may_block[i], hand_only)
             reason = causes[i]
             if reason is None:
                 reason = Reason.LIMITS if remedies.limits_help() else Reason.NOT_FOUND
@@ -266,7 +261,7 @@ class Diagnostician:
             rows = np.flatnonzero(has_contacts & np.array([proof is None for proof in proofs]))
             if not len(rows) or targets.fixed is not None:
                 continue
-            side_targets = targets.rows(rows).for_fingers(fingers)
+            side_targets = targets.rows(rows).for_part(fingers)
             for row, proof in zip(
                 rows.tolist(), prover.prove(side_targets, max_boxes=max_boxes[rows]), strict=True
             ):
@@ -274,12 +269,12 @@ class Diagnostician:
         return proofs
 
     def _fit_hands(
-        self, targets: TargetBatch, q0: Array
+        self, targets: TargetBatch
     ) -> tuple[Sequence[tuple[HandFit | None, ArmReach | None]], HandFits | None]:
         """Return hand fit and arm reach of each target, and all fits; None without an arm."""
         if not self.robot.description.arm_actuators:
             return [(None, None)] * len(targets), None
-        hand_fits = self._floating_palm.fit(targets, q0)
+        hand_fits = self._floating_palm.fit(targets)
         return self._floating_palm.evidence(targets, hand_fits), hand_fits
 
     def _is_certain(

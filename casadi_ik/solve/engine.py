@@ -15,14 +15,13 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.errors import InputError, RowError, UnsupportedError
-from casadi_ik.files.arrays import Array
 from casadi_ik.files.progress import is_interactive, progress
 from casadi_ik.files.writing import BackgroundWriter
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contact_batches import group_by_kinds
 from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds
 from casadi_ik.model.grasp import Tolerance
-from casadi_ik.model.targets import TargetBatch
+from casadi_ik.model.targets import MANIPULABILITY, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
 from casadi_ik.solve.batches import BatchParts, SolvedPart, judge_outcome, map_ordered
 from casadi_ik.solve.collision_free import RANKING_PREFERENCES, resolve_collisions, resolve_single
@@ -35,17 +34,12 @@ from casadi_ik.solve.method import HandSearch, Method, Outcome, SingleOutcome
 from casadi_ik.solve.nearest import NearestSearch
 from casadi_ik.solve.recorder import Recorder
 from casadi_ik.solve.remedies import add_collision_remedies
-from casadi_ik.solve.request import CLEARANCE, NO_PREFERENCE, resolve_preference
 from casadi_ik.solve.sensitivity import SensitivityKernel
 from casadi_ik.solve.solution import BatchSolution, Solution
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.subproblems import SubproblemSolver
-from casadi_ik.solve.turns import in_nearest_turns, search_start
+from casadi_ik.solve.turns import in_nearest_turns, with_search_starts
 from casadi_ik.solve.verdict import construct_unchecked, judge_errors, judge_single
-
-MANIPULABILITY = "manipulability"
-"""Preference that is applied by ranking alternatives after the solve."""
-
 
 LOCAL = "local"
 """Best effort that stays near the start."""
@@ -53,11 +47,9 @@ LOCAL = "local"
 
 @dataclass(frozen=True, eq=False)
 class SolveOptions:
-    """Options of a solve that do not belong to its targets.
+    """Options of a solve that do not change the solutions of its targets, except `best_effort`.
 
     Attributes:
-        q0: (n,) start, or (k, n) for k targets [rad or m]; None: the robot's home.
-        seed: Seed of all random numbers, >= 0.
         jobs: Number of threads, at least 1; compiled loops run concurrently.
         recorder: Recorder of the iterations; None: they are not recorded.
         diagnose: Whether to diagnose targets that are not solved.
@@ -66,8 +58,6 @@ class SolveOptions:
         show_progress: Whether to show a progress bar on an interactive terminal.
     """
 
-    q0: ArrayLike | None = None
-    seed: int = 0
     jobs: int = 1
     recorder: Recorder | None = None
     diagnose: bool = False
@@ -79,28 +69,9 @@ class SolveOptions:
             raise InputError(
                 f"best_effort: found {self.best_effort!r}, expected True, False or {LOCAL!r}"
             )
-        for name, minimum in (("jobs", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if type(value) is int and value >= minimum:
-                continue
-            if not isinstance(value, (int, np.integer)) or value < minimum:
-                raise InputError(f"{name}: found {value!r}, expected an integer >= {minimum}")
-            object.__setattr__(self, name, int(value))
-
-    def starts(self, robot: ArmHand, count: int) -> Array:
-        """Return (count, n) start configurations.
-
-        Raises:
-            InputError: Wrong shape or numbers, or another number of rows than targets.
-        """
-        start = robot.start(self.q0)
-        if start.ndim == 1:
-            return np.repeat(start[None], count, axis=0)
-        if len(start) != count:
-            raise InputError(
-                f"q0: found {len(start)} rows for {count} targets, expected {count}, or one (n,)"
-            )
-        return start
+        if not isinstance(self.jobs, (int, np.integer)) or self.jobs < 1:
+            raise InputError(f"jobs: found {self.jobs!r}, expected an integer >= 1")
+        object.__setattr__(self, "jobs", int(self.jobs))
 
 
 REQUIRED_ARRAYS = ("points", "normals")
@@ -245,30 +216,6 @@ class Engine:
         """Return the collision query of targets; None without a scene."""
         return None if self.check is None else self.check.collision_query(targets)
 
-    def resolve_preference(self, prefer: str | None, has_start: bool) -> str:
-        """Return the preference of a solve, see `request.resolve_preference`.
-
-        Raises:
-            InputError: The preference is unknown.
-            UnsupportedError: The method does not support it.
-        """
-        preference, method = resolve_preference(prefer, has_start), self.method
-        if preference == CLEARANCE and self.check is None:
-            raise InputError(f"prefer: {preference!r} needs a solver with a scene")
-        if method.preferences:
-            if preference in method.preferences:
-                return preference
-            raise UnsupportedError(
-                f"prefer: {preference!r} is not supported by method {method.name!r}; expected one "
-                f"of {', '.join(method.preferences)}"
-            )
-        if prefer is None:
-            return NO_PREFERENCE
-        raise UnsupportedError(
-            f"prefer: {prefer!r} is not supported by method {method.name!r}, which returns the "
-            "first solution it finds; expected None"
-        )
-
     def solve_one(self, targets: TargetBatch, options: SolveOptions) -> Solution:
         """Solve one target with as little overhead as the method allows.
 
@@ -277,37 +224,34 @@ class Engine:
             options: Options of the solve.
 
         Raises:
-            InputError: Bad q0, or a target that the method does not support.
+            InputError: The method does not support the target.
         """
         if targets.extra_vectors and (engine := self.engine_for(targets)) is not self:
             return engine.solve_one(targets, options)
-        method, start, outcome = self.hand_search, self.robot.start(options.q0), None
-        is_plain = (
-            targets.palms is None and targets.prefer not in RANKING_PREFERENCES and start.ndim == 1
-        )
+        method, outcome = self.hand_search, None
+        is_plain = targets.palms is None and targets.prefer not in RANKING_PREFERENCES
         if method is not None and is_plain and options.recorder is None:
-            interim = self._interim_solver.solve(targets, start, self.check)
+            interim = self._interim_solver.solve(targets, self.check)
             if interim is not None:
                 return interim
             method.prepare()
             started = time.perf_counter()
-            single = method.solve_single(targets, start)
+            single = method.solve_single(targets)
             if single is not None:
-                solution = self._single_solution(targets, single, start, started)
+                solution = self._single_solution(targets, single, started)
                 if solution is not None:
                     return solution
                 outcome = single.outcome(time.perf_counter() - started)
         return self.solve(targets, options, outcome).solution(0)
 
     def _single_solution(
-        self, targets: TargetBatch, outcome: SingleOutcome, start: Array, started: float
+        self, targets: TargetBatch, outcome: SingleOutcome, started: float
     ) -> Solution | None:
         """Return the solution of one target if its outcome passes the verdict and is free.
 
         Args:
             targets: One target.
             outcome: Result of the method.
-            start: (n,) start configuration [rad or m].
             started: Start of the solve [s], as `time.perf_counter` counts.
         """
         if outcome.status != Status.SOLVED:
@@ -323,12 +267,12 @@ class Engine:
         if (query := self.collision_query(targets)) is not None:
             clearances = query.check(q[None])
             if not clearances.free[0]:
-                near = search_start(robot.description, start)
-                free = resolve_single(self.finder, targets, query, q, near)
+                near = with_search_starts(robot.description, targets)
+                free = resolve_single(self.finder, near, query, q)
                 if free is None:
                     return None
                 q, verdict, clearances = free
-                q = in_nearest_turns(robot.description, targets, q, start)
+                (q,) = in_nearest_turns(robot.description, targets, q[None])
                 seconds = time.perf_counter() - started
             distance, pair = float(clearances.distance[0]), clearances.pair(0)
         return construct_unchecked(
@@ -361,11 +305,11 @@ class Engine:
             outcome: Result of the method, if it has run already.
 
         Raises:
-            InputError: Bad q0, or targets that the method does not support.
+            InputError: The method does not support the targets.
         """
         if targets.palms is not None:
             self._require_hand_search()  # no other method keeps the hand of each target
-        starts, recorder = options.starts(self.robot, len(targets)), options.recorder
+        recorder = options.recorder
         # Build before clock and threads start, so that no solve is charged for it.
         needs_finder = targets.prefer == MANIPULABILITY or self.check is not None
         for engine, _, _ in self.group_by_contact_kind(targets):
@@ -382,10 +326,10 @@ class Engine:
             BackgroundWriter() as background,
             progress(len(targets), options.show_progress) as report_progress,
         ):
-            for part in self._parts(targets, starts, options, outcome):
+            for part in self._parts(targets, options, outcome):
                 report_progress(len(part.batch))
                 if recorder is not None:
-                    background.do(partial(part.record, recorder, trace_format, options.seed))
+                    background.do(partial(part.record, recorder, trace_format))
                 batches.append(part.batch)
         return BatchSolution.joined(batches)
 
@@ -404,17 +348,15 @@ class Engine:
             parse: Function of arrays by name and the number of the first target that returns
                 checked targets.
             tolerances: Tolerance by finger.
-            options: Options of the solve, with a single start (n,).
+            options: Options of the solve.
             first_row: Number of the first target.
 
         Yields:
             The solved blocks.
 
         Raises:
-            InputError: Bad q0, or a block of the wrong shape.
+            InputError: A block has the wrong shape.
         """
-        if self.robot.start(options.q0).ndim != 1:
-            raise InputError("q0: found several, expected one start for all targets")
         template = (
             self.method.name,
             self.robot,
@@ -453,56 +395,55 @@ class Engine:
             first_row += count
 
     def _parts(
-        self, targets: TargetBatch, starts: Array, options: SolveOptions, known: Outcome | None
+        self, targets: TargetBatch, options: SolveOptions, known: Outcome | None
     ) -> Iterator[SolvedPart]:
         """Yield the parts of the batch in order: solved concurrently, checked and diagnosed."""
-        trace, seed = options.recorder is not None, options.seed
+        trace = options.recorder is not None
         show_progress = options.show_progress and is_interactive()
         parts = BatchParts(len(targets), options.jobs, trace, show_progress)
 
         def solve(rows: slice) -> SolvedPart:
-            started, part, q0 = time.time_ns(), targets.rows(rows), starts[rows]
-            near = search_start(self.robot.description, q0)
-            outcome = known or self._run(part, near, seed, trace)
+            started, part = time.time_ns(), targets.rows(rows)
+            near = with_search_starts(self.robot.description, part)
+            outcome = known or self._run(near, trace)
             if outcome.rows is not None:
                 parts.adapt_to_memory(len(outcome.q), outcome.rows.nbytes)
             query = self.collision_query(part)
             if query is None and targets.prefer == MANIPULABILITY:
-                outcome = self._maximise_manipulability(part, near, seed, outcome)
+                outcome = self._maximise_manipulability(near, outcome)
             batch = judge_outcome(self.robot, self.method.name, part, outcome, query)
             if query is not None and self.hand_search is not None:
                 batch = resolve_collisions(
                     lambda group: self.engine_for(group).finder,
-                    part,
-                    query,
                     near,
-                    seed,
+                    query,
                     outcome,
                     batch,
                     options.diagnose,
                 )
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if options.diagnose:
-                batch = self._diagnose(part, near, outcome, batch)
+                batch = self._diagnose(near, outcome, batch)
                 if self.check is not None and len(targets) == 1:
-                    retry = SolveOptions(starts[0], seed)
                     batch = add_collision_remedies(
-                        lambda changed: self.solve(changed, retry).success, self.check, part, batch
+                        lambda changed: self.solve(changed, SolveOptions()).success,
+                        self.check,
+                        part,
+                        batch,
                     )
             if options.best_effort:
                 is_local = options.best_effort == LOCAL
-                batch = self._replace_by_nearest(part, near, outcome, batch, query, is_local)
-            q = in_nearest_turns(self.robot.description, part, batch.q, q0)
+                batch = self._replace_by_nearest(near, outcome, batch, query, is_local)
+            q = in_nearest_turns(self.robot.description, part, batch.q)
             batch = replace(batch, q=q)
             parts.adapt_to_time(1e-9 * (time.time_ns() - started))
-            return SolvedPart(part, q0, started, outcome, batch, query)
+            return SolvedPart(part, started, outcome, batch, query)
 
         return map_ordered(solve, parts, options.jobs)
 
     def _replace_by_nearest(
         self,
         targets: TargetBatch,
-        starts: Array,
         outcome: Outcome,
         batch: BatchSolution,
         query: CollisionQuery | None,
@@ -520,10 +461,10 @@ class Engine:
         for engine, members, group in self.group_by_contact_kind(targets.rows(rows)):
             members, search = rows[members], engine.nearest_search
             if is_local:
-                q[members] = search.descend(group, starts[members])
+                q[members] = search.descend(group)
             else:
                 group_query = None if query is None else query.rows(members)
-                q[members] = search.find(group, starts[members], q[members], group_query)
+                q[members] = search.find(group, q[members], group_query)
         if query is not None:
             rows = rows[query.rows(rows).check(q[rows]).free]
             q = np.where(np.isin(np.arange(len(q)), rows)[:, None], q, batch.q)
@@ -537,30 +478,28 @@ class Engine:
             nearest, status=status, diagnoses=batch.diagnoses, collisions=batch.collisions
         )
 
-    def _run(self, targets: TargetBatch, starts: Array, seed: int, trace: bool) -> Outcome:
+    def _run(self, targets: TargetBatch, trace: bool) -> Outcome:
         """Run the method on targets of any contact kinds."""
         indices, outcomes = [], []
         for engine, rows, group in self.group_by_contact_kind(targets):
             indices.append(rows)
-            outcomes.append(engine.method.run(group, starts[rows], seed, trace))
+            outcomes.append(engine.method.run(group, trace))
         return outcomes[0] if len(outcomes) == 1 else Outcome.interleaved(indices, outcomes)
 
-    def _maximise_manipulability(
-        self, targets: TargetBatch, starts: Array, seed: int, outcome: Outcome
-    ) -> Outcome:
+    def _maximise_manipulability(self, targets: TargetBatch, outcome: Outcome) -> Outcome:
         """Replace the arm of each solution by the most manipulable one; the hands stay."""
         started, q = time.perf_counter(), outcome.q.copy()
         rows = np.flatnonzero(outcome.status == Status.SOLVED)
         for row in rows:
             target = targets.rows(slice(row, row + 1))
             finder = self.engine_for(target).finder
-            q[row] = finder.best_arm(target, q[row], starts[row], seed, MANIPULABILITY)
+            q[row] = finder.best_arm(target, q[row], MANIPULABILITY)
         seconds = outcome.time.copy()
         seconds[rows] += (time.perf_counter() - started) / max(len(rows), 1)
         return replace(outcome, q=q, time=seconds)
 
     def _diagnose(
-        self, targets: TargetBatch, starts: Array, outcome: Outcome, batch: BatchSolution
+        self, targets: TargetBatch, outcome: Outcome, batch: BatchSolution
     ) -> BatchSolution:
         """Add diagnoses of unsolved targets to a batch.
 
@@ -577,7 +516,7 @@ class Engine:
         for engine, members, group in self.group_by_contact_kind(unsolved):
             group_rows = rows[members]
             nearest = q[group_rows] if is_hand_search else None
-            diagnoses = engine.diagnostician.diagnose(group, starts[group_rows], nearest)
+            diagnoses = engine.diagnostician.diagnose(group, nearest)
             by_row |= zip(group_rows.tolist(), diagnoses, strict=True)
         for row, diagnosis in by_row.items():
             if is_hand_search and diagnosis.reason is Reason.REACHABLE:

@@ -11,8 +11,8 @@ from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.grasp import real_array
 from casadi_ik.solve.engine import Engine, SolveOptions
-from casadi_ik.solve.request import Request, resolve_preference
 from casadi_ik.solve.status import Status
+from casadi_ik.solve.target_builder import TargetBuilder
 
 STATUS_BY_CODE = {int(status): status for status in Status}
 
@@ -33,12 +33,12 @@ class FastSolver:
         angle_error: (f,) angles of the last result [rad], NaN where free.
     """
 
-    def __init__(self, engine: Engine, request: Request) -> None:
+    def __init__(self, engine: Engine, target_builder: TargetBuilder) -> None:
         """Compile the method if necessary, and allocate its memory.
 
         Args:
             engine: Engine without a scene.
-            request: Defaults of the targets.
+            target_builder: Builder of the targets.
 
         Raises:
             UnsupportedError: The method is not hand-first, or there is a scene.
@@ -49,12 +49,12 @@ class FastSolver:
         if method is None:
             name = engine.method.name
             raise UnsupportedError(f"fast: expected method 'hand-first', found {name!r}")
-        self._engine, self._request = engine, request
+        self._engine, self._target_builder = engine, target_builder
         robot = engine.robot
         f, n = len(robot.fingers), len(robot.actuators)
         self._home, self._shapes = robot.home, ((f, 3), (f, 3), (n,))
         self.position_error, self.angle_error = np.full(f, np.nan), np.full(f, np.nan)
-        self._search = search = method.new_search(request.enforce_limits)
+        self._search = search = method.new_search(target_builder.enforce_limits)
         if search is None:
             return
         self._points, self._normals, self._start = search.points, search.normals, search.q0
@@ -63,7 +63,7 @@ class FastSolver:
         self.position_error, self.angle_error = search.position_error, search.angle_error
         # Tolerances and limits are the same for all targets.
         any_contact = np.zeros((1, *self._shapes[0])), np.ones((1, *self._shapes[0]))
-        self._parameters[...] = method.terms(request.of_arrays(*any_contact, None))
+        self._parameters[...] = method.terms(target_builder.from_arrays(*any_contact))
 
     def __call__(
         self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None = None
@@ -108,12 +108,11 @@ class FastSolver:
         Raises:
             InputError: Wrong shapes or numbers.
         """
-        request = self._request
-        prefer = resolve_preference(None, q0 is not None)
+        builder = self._target_builder
         arrays: Any = [points], [normals]
-        targets = request.of_arrays(arrays[0], arrays[1], None, prefer=prefer)
-        start = request.start(q0)
-        solution = self._engine.solve(targets, SolveOptions(start)).solution(0)
+        start = None if q0 is None else builder.start(q0)
+        targets = builder.from_arrays(arrays[0], arrays[1], q0=start)
+        solution = self._engine.solve(targets, SolveOptions()).solution(0)
         verdicts = solution.contacts.values()
         self.position_error[...] = [verdict.position_error for verdict in verdicts]
         self.angle_error[...] = [verdict.angle_error for verdict in verdicts]

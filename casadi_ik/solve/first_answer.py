@@ -23,13 +23,12 @@ from casadi_ik.collision.clearance import SceneCheck
 from casadi_ik.compile.cancellation import cached_only, virtual_machine
 from casadi_ik.compile.compiler import find_compiler, print_note, waits_for_compiler
 from casadi_ik.compile.libraries import NotCachedError
-from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.batches import judge_outcome
 from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.solution import Solution
-from casadi_ik.solve.turns import in_nearest_turns, search_start
+from casadi_ik.solve.turns import in_nearest_turns, with_search_starts
 
 
 @dataclass(frozen=True)
@@ -76,14 +75,11 @@ class InterimSolver:
         self._last_poll = 0.0
         self._lock = threading.Lock()
 
-    def solve(
-        self, targets: TargetBatch, start: Array, check: SceneCheck | None
-    ) -> Solution | None:
+    def solve(self, targets: TargetBatch, check: SceneCheck | None) -> Solution | None:
         """Solve a target in the virtual machine.
 
         Args:
             targets: One target.
-            start: (n,) start configuration [rad or m].
             check: Collision check of the scene; None: collisions are not checked.
 
         Returns:
@@ -98,9 +94,8 @@ class InterimSolver:
                 # The compiled method and the virtual one must not share functions of the robot.
                 self._virtual = virtual, ArmHand(virtual.robot)
             virtual, robot = self._virtual
-            near = search_start(virtual.robot, start)[None]
-            outcome = virtual.run(targets, near, 0, False, rounds=1)
-            q = in_nearest_turns(virtual.robot, targets, outcome.q, start)
+            outcome = virtual.run(with_search_starts(virtual.robot, targets), rounds=1)
+            q = in_nearest_turns(virtual.robot, targets, outcome.q)
             outcome = replace(outcome, q=q)
             query = None
             if check is not None:

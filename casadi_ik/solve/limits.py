@@ -20,9 +20,10 @@ def clamp_to_limits(robot: RobotDescription, q: Expr, enforce: Expr) -> Expr:
     return ca.if_else(enforce > 0, ca.fmin(ca.fmax(q, lower), upper), q)
 
 
-def clip_starts(robot: RobotDescription, targets: TargetBatch, q0: Array) -> Array:
+def clip_starts(robot: RobotDescription, targets: TargetBatch) -> Array:
     """Return start configurations (k, n), clipped to the limits if targets enforce them."""
-    return np.clip(q0, robot.lower, robot.upper) if targets.enforce_limits else q0
+    starts = targets.starts(robot)
+    return np.clip(starts, robot.lower, robot.upper) if targets.enforce_limits else starts
 
 
 def limit_mask(robot: RobotDescription, q: Expr) -> Expr:

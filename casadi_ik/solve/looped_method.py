@@ -80,13 +80,8 @@ class LoopedMethod(ABC):
         """Build the graph of an iteration."""
 
     @abstractmethod
-    def begin(self, targets: TargetBatch, q0: Array) -> Start:
-        """Return the initial states and parameters of a batch, see `Layout.pack_rows`.
-
-        Args:
-            targets: k targets.
-            q0: (k, n) start configurations.
-        """
+    def begin(self, targets: TargetBatch) -> Start:
+        """Return the initial states and parameters of k targets, see `Layout.pack_rows`."""
 
     @abstractmethod
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
@@ -149,18 +144,17 @@ class LoopedMethod(ABC):
         del kinds
         return self
 
-    def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
+    def stepper(self, targets: TargetBatch) -> Stepper:
         """Return a stepper of one target, see `Method.stepper`."""
         self._check(targets)
-        states, parameters = self.begin(targets, q0[None])
+        states, parameters = self.begin(targets)
         return Stepper(self.kernel, states[0], parameters[0])
 
-    def run(self, targets: TargetBatch, q0: Array, seed: int, trace: bool) -> Outcome:
+    def run(self, targets: TargetBatch, trace: bool = False) -> Outcome:
         """Solve a batch, see `Method.run`; no random numbers are drawn."""
-        del seed
         self._check(targets)
         started = time.perf_counter()
-        states, parameters = self.begin(targets, q0)
+        states, parameters = self.begin(targets)
         result = self.kernel.run(states, parameters, self.max_iterations, trace)
         # Time spent on the batch as a whole is divided equally among its solves.
         overhead = max(time.perf_counter() - started - result.time.sum(), 0.0)

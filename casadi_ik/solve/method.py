@@ -212,12 +212,11 @@ class Method(Protocol):
         """
         ...
 
-    def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
+    def stepper(self, targets: TargetBatch) -> Stepper:
         """Return a stepper that solves one target iteration by iteration.
 
         Args:
             targets: One target.
-            q0: (n,) start configuration.
 
         Raises:
             RowError: The method does not support the target (for example a free finger).
@@ -225,13 +224,11 @@ class Method(Protocol):
         """
         ...
 
-    def run(self, targets: TargetBatch, q0: Array, seed: int, trace: bool) -> Outcome:
+    def run(self, targets: TargetBatch, trace: bool = False) -> Outcome:
         """Solve a batch of targets of the method's contact kinds.
 
         Args:
-            targets: The targets.
-            q0: (k, n) start configurations.
-            seed: Seed of all random numbers; a target gets the same numbers in any batch.
+            targets: The targets. A target gets the same random numbers in any batch.
             trace: Whether to record every iteration.
 
         Raises:
@@ -343,14 +340,12 @@ class HandSearch(Method, Protocol):
         """Return the method evaluated by CasADi's virtual machine."""
         ...
 
-    def run(
-        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
-    ) -> Outcome:
+    def run(self, targets: TargetBatch, trace: bool = False, rounds: int | None = None) -> Outcome:
         """Solve a batch with at most `rounds` restarts; see `Method.run`."""
         ...
 
-    def solve_single(self, targets: TargetBatch, q0: Array) -> SingleOutcome | None:
-        """Solve one target from q0 (n,) with less overhead than `run`; None if it cannot."""
+    def solve_single(self, targets: TargetBatch) -> SingleOutcome | None:
+        """Solve one target with less overhead than `run`; None if it cannot."""
         ...
 
     def new_search(self, enforce_limits: bool) -> SingleSearch | None:
@@ -366,13 +361,12 @@ class HandSearch(Method, Protocol):
         ...
 
     def rows(
-        self, targets: TargetBatch, q0: Array, postures: Array, skip_q0: bool = False
+        self, targets: TargetBatch, postures: Array, skip_q0: bool = False
     ) -> tuple[Array, Array]:
         """Return initial states and parameters of the loop for `run_rows`.
 
         Args:
             targets: k targets.
-            q0: (k, n) start configurations.
             postures: (k, candidates, hand) seeds, or (k, 1, hand).
             skip_q0: Whether to skip the search for a solution near q0.
         """

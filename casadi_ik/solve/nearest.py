@@ -227,20 +227,19 @@ class NearestSearch:
     def find(
         self,
         targets: TargetBatch,
-        q0: Array,
         last_q: Array,
         query: CollisionQuery | None = None,
     ) -> Array:
         """Return the nearest configurations found (k, n) [rad or m].
 
         Args:
-            targets: k targets of the kinds of contacts of this search.
-            q0: (k, n) start configurations, which decide between equally near ones [rad or m].
+            targets: k targets of the kinds of contacts of this search; their starts decide between
+                equally near configurations.
             last_q: (k, n) configurations at which the solves ended; NaN: none [rad or m].
             query: Collision query of the targets; None: collisions are not checked. If none of a
                 target's minima is free of collisions, the nearest one is returned.
         """
-        all_rows = np.arange(len(targets))
+        all_rows, q0 = np.arange(len(targets)), targets.starts(self._trials.robot.description)
         last_q = np.where(np.isfinite(last_q), last_q, q0)
         bounds = targets.bounds(self._trials.robot.description)
         seed_owner, seeds = self._seeds.find(targets, _weights(targets), *bounds)
@@ -259,13 +258,9 @@ class NearestSearch:
             distance = np.where(is_free, distance, IN_COLLISION * (1 + distance))
         return self._nearest(q0, owner, q, distance)
 
-    def descend(self, targets: TargetBatch, q: Array) -> Array:
-        """Return the local minima (k, n) of the distance next to configurations.
-
-        Args:
-            targets: k targets of the kinds of contacts of this search.
-            q: (k, n) configurations [rad or m].
-        """
+    def descend(self, targets: TargetBatch) -> Array:
+        """Return the local minima (k, n) of the distance next to the starts of k targets."""
+        q = targets.starts(self._trials.robot.description)
         parameters = self._parameters(targets, DESCENT.local_step)
         return self._q(self._run(self._states(parameters, q), parameters))
 

@@ -27,13 +27,13 @@ class RandomSteps:
         ranges: (n,) positive ranges of the motors [rad or m].
     """
 
-    def __init__(self, subproblems: SubproblemSolver, targets: TargetBatch, seed: int) -> None:
-        """Store the solver of subproblems, k targets and the seed."""
+    def __init__(self, subproblems: SubproblemSolver, targets: TargetBatch) -> None:
+        """Store the solver of subproblems and k targets."""
         self.robot = robot = subproblems.robot
         is_multi_arm = bool(robot.description.sides)
         self.samples = COLLISION_FREE_PARAMETERS.step_samples[is_multi_arm]
         self.ranges = np.maximum(robot.upper - robot.lower, COLLISION_FREE_PARAMETERS.min_range)
-        self._subproblems, self._targets, self._seed = subproblems, targets, seed
+        self._subproblems, self._targets = subproblems, targets
         self._limits = subproblems.limits(targets)
 
     @cached_property
@@ -63,7 +63,7 @@ class RandomSteps:
         samples, size = self.samples, COLLISION_FREE_PARAMETERS.contact_steps[number]
         target_index, starts = np.repeat(rows, samples), np.repeat(q, samples, axis=0)
         targets, contacts = self._targets.rows(target_index), self.robot.contacts(starts)
-        random, displaced = np.random.default_rng([self._seed, number]), []
+        random, displaced = np.random.default_rng([self._targets.seed, number]), []
         target_contacts = (
             (targets.points, targets.position_tolerance),
             (targets.normals, targets.angle_tolerance),
@@ -100,7 +100,7 @@ class RandomSteps:
         """
         target_index = np.repeat(rows, self.samples)
         ranges = self.ranges[motors]
-        random = np.random.default_rng([self._seed, number])
+        random = np.random.default_rng([self._targets.seed, number])
         steps = random.standard_normal((self.samples, len(ranges)))
         starts = np.repeat(q, self.samples, axis=0)
         starts[:, motors] += size * ranges * np.tile(steps, (len(rows), 1))
@@ -129,7 +129,7 @@ class RandomSteps:
         moving = np.setdiff1d(np.arange(len(self.ranges)), self.robot.description.hand_actuators)
         rows = np.repeat(np.arange(len(q)), self.samples)
         q, target_index = q[rows], target_index[rows]
-        starts, random = q.copy(), np.random.default_rng([self._seed, number])
+        starts, random = q.copy(), np.random.default_rng([self._targets.seed, number])
         steps = random.standard_normal(
             (COLLISION_FREE_PARAMETERS.pool_size, self.samples, len(moving))
         )
@@ -152,7 +152,7 @@ class RandomSteps:
         hand = list(self.robot.description.hand_actuators)
         target_index = np.repeat(rows, count)
         numbers = np.array([self._targets.row_number(int(row)) for row in rows])
-        starts = np.concatenate(_shifted_samples(self.robot, self._seed, numbers, count))
+        starts = np.concatenate(_shifted_samples(self.robot, self._targets.seed, numbers, count))
         starts[::2, hand] = q[target_index[::2]][:, hand]
         starts = self._limits.select_rows(target_index).clip(starts)
         return self.select_solved(self._refinement.run(target_index, starts), target_index)

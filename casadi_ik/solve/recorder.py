@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import CollisionQuery
-from casadi_ik.files.arrays import Array
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.solution import BatchSolution
 from casadi_ik.solve.trace import TraceFormat
@@ -27,8 +26,6 @@ class SolveBlock:
         format: Layout and labels of the rows.
         first: Number of the first solve; numbers are unique per method in a log.
         targets: The targets.
-        starts: (k, n) start configurations [rad or m].
-        seed: Seed of the random numbers.
         batch: The solutions, which name method, robot and fingers.
         rows: (sum of `BatchSolution.iterations`,) iterations of all solves, ordered by solve.
         started: (k,) start times [ns since the Unix epoch].
@@ -38,8 +35,6 @@ class SolveBlock:
     format: TraceFormat
     first: int
     targets: TargetBatch
-    starts: Array
-    seed: int
     batch: BatchSolution
     rows: NDArray[Any]
     started: NDArray[np.int64]

@@ -128,7 +128,6 @@ class RemedyFinder:
     Attributes:
         subproblems: Solver of subproblems.
         targets: One target.
-        q0: (n,) initial configuration.
         q: (n,) nearest configuration of the failed solve.
         may_block: (n,) True for actuators whose limit alone may block the target.
         hand_only: True if the hand does not fit, so that the arm cannot help.
@@ -136,7 +135,6 @@ class RemedyFinder:
 
     subproblems: SubproblemSolver
     targets: TargetBatch
-    q0: Array
     q: Array
     may_block: NDArray[np.bool_]
     hand_only: bool
@@ -158,7 +156,7 @@ class RemedyFinder:
             return True
         # All limits relaxed together help if any of them does.
         last = Bounds(bounds.lower[-1:], bounds.upper[-1:])
-        q = self.subproblems.search(self.targets, self.q0, last)
+        q = self.subproblems.search(self.targets, last)
         return bool(self._solves(self.targets, q, last)[0])
 
     def _reliefs(self) -> Iterator[Relief]:
@@ -240,7 +238,7 @@ class RemedyFinder:
         if len(failed):
             remaining_bounds = Bounds(bounds.lower[failed], bounds.upper[failed])
             remaining = candidates.rows(failed)
-            q[failed] = self.subproblems.search(remaining, self.q0, remaining_bounds)
+            q[failed] = self.subproblems.search(remaining, remaining_bounds)
             solved_rows[failed] = self._solves(remaining, q[failed], remaining_bounds)
         return {int(i): q[i] for i in np.flatnonzero(solved_rows)}
 

@@ -90,20 +90,19 @@ class SubproblemSolver:
         """Return the bounds of solutions, (n,) or (k, n), see `TargetBatch.bounds`."""
         return Bounds(*targets.bounds(self.robot.description))
 
-    def search(self, targets: TargetBatch, start: Array, bounds: Bounds) -> Array:
+    def search(self, targets: TargetBatch, bounds: Bounds) -> Array:
         """Run the first restart of hand-first for each of k targets.
 
         Args:
             targets: The targets.
-            start: (n,) start configuration [rad or m].
             bounds: (k, n) bounds [rad or m].
 
         Returns:
             (k, n) configurations [rad or m].
         """
-        starts = bounds.clip(start)
+        targets = targets.starting_at(bounds.clip(targets.starts(self.robot.description)))
         postures = self.method.postures(targets, 0)
-        states, parameters = self.method.rows(targets, starts, postures)
+        states, parameters = self.method.rows(targets, postures)
         self.set_bounds(parameters, bounds)
         return self.run(states, parameters)
 
@@ -111,7 +110,6 @@ class SubproblemSolver:
         self,
         targets: TargetBatch,
         rows: Rows,
-        starts: Array,
         postures: Array,
         first_palm_number: int = 0,
     ) -> tuple[Rows, Array, Array]:
@@ -120,7 +118,6 @@ class SubproblemSolver:
         Args:
             targets: k targets.
             rows: (c,) indices of the selected targets.
-            starts: (k, n) start configurations of all targets [rad or m].
             postures: (c, p, hand) seeds of the selected targets [rad or m].
             first_palm_number: Palm number of the first seed, see `rows.hand_rows`.
 
@@ -133,9 +130,7 @@ class SubproblemSolver:
             first_palm_number + np.tile(np.arange(count), len(rows)),
         )
         flat = postures.reshape(len(owner), postures.shape[2])
-        return owner, *hand_rows(
-            self.method, targets.rows(owner), starts[owner], flat, palm_numbers
-        )
+        return owner, *hand_rows(self.method, targets.rows(owner), flat, palm_numbers)
 
     def solved(self, targets: TargetBatch, q: Array, limits: bool) -> NDArray[np.bool_]:
         """Return (k,) True where q solves its target; within limits if `limits`."""

@@ -29,6 +29,12 @@ def search_start(robot: RobotDescription, q: Array) -> Array:
     return np.where(robot.continuous, q - TURN * np.floor(q / TURN + 0.5), q)
 
 
+def with_search_starts(robot: RobotDescription, targets: TargetBatch) -> TargetBatch:
+    """Return targets with the start configurations of a search, see `search_start`."""
+    q0 = robot.home if targets.q0 is None else targets.q0
+    return targets.starting_at(search_start(robot, q0))
+
+
 def nearest_turns(
     robot: RobotDescription,
     q: Array,
@@ -70,13 +76,15 @@ def nearest_turns(
     return result
 
 
-def in_nearest_turns(robot: RobotDescription, targets: TargetBatch, q: Array, q0: Array) -> Array:
-    """Return solutions in the revolutions nearest to q0, see `nearest_turns`.
+def in_nearest_turns(robot: RobotDescription, targets: TargetBatch, q: Array) -> Array:
+    """Return solutions in the revolutions nearest to the starts, see `nearest_turns`.
 
     Args:
         robot: The robot.
         targets: k targets; motors with limits are moved if the preference is "q0".
-        q: (k, n) or (n,) solutions [rad or m].
-        q0: (k, n) or (n,) reference configurations [rad or m].
+        q: (k, n) solutions [rad or m].
     """
-    return nearest_turns(robot, q, q0, targets.bounds(robot), targets.prefer == "q0")
+    if not robot.multi_turn:
+        return q
+    starts, bounds = targets.starts(robot), targets.bounds(robot)
+    return nearest_turns(robot, q, starts, bounds, targets.prefers_q0)

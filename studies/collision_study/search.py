@@ -13,7 +13,7 @@ import numpy as np
 import casadi_ik as ik
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.files.arrays import Array
-from casadi_ik.solve.request import Request, tolerances_by_finger
+from casadi_ik.solve.target_builder import TargetBuilder, tolerances_by_finger
 from collision_study.oracles import CoalOracle
 
 TABLE = {"kind": "box", "size": [3, 3, 0.04], "xyz": [0, 0, -0.02]}
@@ -194,8 +194,8 @@ def _timed(solver: ik.Solver, points: Array, normals: Array, poses: Array | None
 
 def surroundings(check: SceneCheck, robot: ik.ArmHand, grasp: ik.Grasp) -> CollisionQuery:
     """Return the obstacles that a grasp is checked against."""
-    request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
-    return check.collision_query(request.of_grasps([grasp], None))
+    builder = TargetBuilder(robot, tolerances_by_finger(None, robot.fingers))
+    return check.collision_query(builder.from_grasps([grasp]))
 
 
 def dense(
@@ -233,8 +233,8 @@ def _grasps(robot: ik.ArmHand) -> list[tuple[ik.Grasp, dict[str, Any]]]:
     radii = np.linalg.norm(points - poses[:, None, :3, 3], axis=2).min(axis=1) - SAFE
     point = {"kind": "sphere", "radius": SAFE}
     check = SceneCheck(robot, ik.Scene({BALL: point}, grasped=BALL))
-    request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
-    around = check.collision_query(request.of_arrays(points, normals, None).holding(BALL, poses))
+    builder = TargetBuilder(robot, tolerances_by_finger(None, robot.fingers))
+    around = check.collision_query(builder.from_arrays(points, normals).holding(BALL, poses))
     of_ball = np.array([BALL in names for names in around.table.names])
     clear = around.with_table(around.table.select(~of_ball)).free(q) & (radii > SMALLEST)
     clear &= around.with_table(around.table.select(of_ball)).check(q).distance + SAFE > radii

@@ -8,10 +8,9 @@ from collision_queries import query_at
 
 import casadi_ik as ik
 from casadi_ik.collision.clearance import SceneCheck
-from casadi_ik.model.targets import TargetBatch
+from casadi_ik.model.targets import PREFERENCES, TargetBatch
 from casadi_ik.solve.arm_search import ArmSearch
 from casadi_ik.solve.free_hands import UnconstrainedFingers
-from casadi_ik.solve.request import PREFERENCES
 
 
 @pytest.fixture(scope="module")

@@ -120,9 +120,14 @@ def make_block(
     return SolveBlock(
         format=form,
         first=first,
-        targets=TargetBatch(rng.normal(size=(k, 3, 3)), normals, Tolerance(), True),
-        starts=rng.normal(size=(k, 14)),
-        seed=7,
+        targets=TargetBatch(
+            rng.normal(size=(k, 3, 3)),
+            normals,
+            Tolerance(),
+            True,
+            q0=rng.normal(size=(k, 14)),
+            seed=7,
+        ),
         batch=batch,
         rows=np.concatenate(rows),
         started=T0 + 123_456_789 * (1 + numbers),

@@ -338,8 +338,9 @@ def test_fixed_actuators_beyond_one_word(write: Callable[..., Path]) -> None:
     wide = changed(
         block,
         q=np.zeros((1, 40)),
-        starts=np.ones((1, 40)),
-        targets=TargetBatch(points, normals, ik.Tolerance(), enforce_limits=False, fixed=fixed),
+        targets=TargetBatch(
+            points, normals, ik.Tolerance(), enforce_limits=False, fixed=fixed, q0=np.ones((1, 40))
+        ),
     )
     log = logs.open(write(wide))
     assert log.solves().rows["fixed_mask"].shape == (1, 2)

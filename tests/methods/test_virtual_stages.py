@@ -35,10 +35,9 @@ def test_each_stage_is_followed_by_the_same_one(name: str, prefer: str) -> None:
     )
     points[3:] += rng.normal(0.0, 0.001, points[3:].shape)  # contacts that contradict each other
     targets = replace(TargetBatch(points, normals, TOLERANCE, True), prefer=prefer)
-    q0 = np.tile(robot.home, (len(points), 1))
     visits, agreements = Counter[Stage](), Counter[Stage]()
     for number in (0, 1):
-        for state, parameters in zip(*method.begin(targets, q0, number), strict=True):
+        for state, parameters in zip(*method.begin(targets, number), strict=True):
             if number:
                 state[layout.slice("candidates_before")] = method.options.candidates
             status, count = RUNNING, 0

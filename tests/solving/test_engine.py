@@ -29,10 +29,10 @@ class Answering:
     def prepare(self):
         """Do nothing."""
 
-    def run(self, problems, q0, seed, trace):
-        k = len(problems)
+    def run(self, targets, trace=False):
+        k = len(targets)
         return Outcome(
-            q=q0,
+            q=targets.q0,
             status=np.full(k, int(self.status)),
             iterations=np.ones(k, dtype=np.int64),
             restarts=np.zeros(k, dtype=np.int64),
@@ -41,9 +41,9 @@ class Answering:
         )
 
 
-def targets(robot, q, enforce=True):
+def targets(robot, q, q0, enforce=True):
     points, normals = robot.contacts(q)
-    return TargetBatch(points, normals, ik.Tolerance(), enforce)
+    return TargetBatch(points, normals, ik.Tolerance(), enforce, q0=q0)
 
 
 @pytest.mark.parametrize("enforce", [True, False])
@@ -51,7 +51,7 @@ def test_limits_are_part_of_success_where_enforced(robot, enforce):
     """The method is sure of itself, the contacts are met, but a motor is beyond its limit."""
     q = np.tile(robot.home, (2, 1))
     q[1, 6] = robot.upper[6] + 0.01
-    batch = Engine(robot, Answering()).solve(targets(robot, q, enforce), SolveOptions(q))
+    batch = Engine(robot, Answering()).solve(targets(robot, q, q, enforce), SolveOptions())
     np.testing.assert_array_equal(batch.limits_ok, [True, False])
     np.testing.assert_array_equal(batch.success, [True, not enforce])
     assert list(batch.status_names) == ["SOLVED", "STALLED" if enforce else "SOLVED"]
@@ -65,7 +65,7 @@ def test_verdict_overrides_the_method(robot, status):
     q = np.tile(robot.home, (2, 1))
     goals = q.copy()
     goals[1, 0] += 0.5
-    batch = Engine(robot, Answering(status)).solve(targets(robot, goals), SolveOptions(q))
+    batch = Engine(robot, Answering(status)).solve(targets(robot, goals, q), SolveOptions())
     assert list(batch.status_names) == ["SOLVED", status.name]
     np.testing.assert_array_equal(batch.success, [True, False])
 

@@ -10,7 +10,7 @@ import numpy as np
 import casadi_ik as ik
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.files.arrays import Array
-from casadi_ik.solve.request import Request, tolerances_by_finger
+from casadi_ik.solve.target_builder import TargetBuilder, tolerances_by_finger
 from grasp_synthesis.fingertip_pinch import TipPinch
 
 MARGIN = 0.5e-3  # [m] that everything is apart at least
@@ -30,8 +30,8 @@ def surroundings(
         object=item,
         object_pose=pose,
     )
-    request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
-    return check.collision_query(request.of_grasps([grasp], None)).rows(np.zeros(1, dtype=np.intp))
+    builder = TargetBuilder(robot, tolerances_by_finger(None, robot.fingers))
+    return check.collision_query(builder.from_grasps([grasp])).rows(np.zeros(1, dtype=np.intp))
 
 
 def cleared(

@@ -32,9 +32,9 @@ from casadi_ik.integrations.datasets import LAYOUT_NAMES, load_candidates
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.objects import load_object
-from casadi_ik.solve.request import Request, tolerances_by_finger
 from casadi_ik.solve.solution import Solution
 from casadi_ik.solve.solution_files import ranking_data, solution_data
+from casadi_ik.solve.target_builder import TargetBuilder, tolerances_by_finger
 
 TIMING_BUDGET = 0.2
 """Time for which a solve is repeated to measure its time [s]."""
@@ -127,10 +127,10 @@ def _penetration(robot: ArmHand, grasp: Grasp, solution: Solution) -> list[str]:
     shapes = robot.description.shapes.capsules
     if not (solution.success and grasp.object and grasp.object_pose is not None and shapes):
         return []
-    request = Request(robot, tolerances_by_finger(None, robot.fingers), True)
+    builder = TargetBuilder(robot, tolerances_by_finger(None, robot.fingers))
     try:
         check = SceneCheck(robot, Scene(), compiled=False)
-        query = check.collision_query(request.of_grasps([grasp], None))
+        query = check.collision_query(builder.from_grasps([grasp]))
     except CasadiIKError:  # a robot or an object without shapes
         return []
     of_object = np.array([grasp.object in names for names in query.table.names], dtype=bool)

@@ -67,8 +67,7 @@ from casadi_ik.files.shipped import shipped_names
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.load_grasp import load_grasp, shipped_grasps
-from casadi_ik.model.targets import LIMIT_MODES
-from casadi_ik.solve.request import CLEARANCE, PREFERENCES
+from casadi_ik.model.targets import CLEARANCE, LIMIT_MODES, PREFERENCES
 from casadi_ik.solve.solution import Alternative
 
 GRASP_LEGEND = (

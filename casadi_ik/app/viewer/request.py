@@ -18,9 +18,10 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import POINT_CONSTRAINTS, Contact, Grasp, Tolerance
 from casadi_ik.model.pose import inverse
-from casadi_ik.solve.request import CLEARANCE, Request, tolerances_by_finger
+from casadi_ik.model.targets import CLEARANCE
 from casadi_ik.solve.solution import Alternative, Solution
 from casadi_ik.solve.status import Status
+from casadi_ik.solve.target_builder import TargetBuilder, tolerances_by_finger
 from casadi_ik.solve.verdict import ContactVerdict, judge
 
 OBJECT_ITEM = "object"
@@ -339,7 +340,7 @@ class RequestSolver:
         """Return the verdict of a configuration without solving."""
         tolerances = tolerances_by_finger(request.settings.tolerance, self.robot.fingers)
         enforced = request.settings.limits == "enforce"
-        targets = Request(self.robot, tolerances, enforced).of_grasps([request.grasp], None)
+        targets = TargetBuilder(self.robot, tolerances, enforced).from_grasps([request.grasp])
         verdict = judge(self.robot, targets, q[None])
         verdicts = {
             finger: ContactVerdict(

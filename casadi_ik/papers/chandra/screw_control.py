@@ -328,9 +328,7 @@ class ScrewControl:
                 self._step.record, labels, coupling_jacobian(self.robot.description)
             ),
             first=0,
-            targets=TargetBatch(free, free, Tolerance(), enforce_limits=True),
-            starts=trajectory.q[:1],
-            seed=0,
+            targets=TargetBatch(free, free, Tolerance(), enforce_limits=True, q0=trajectory.q[:1]),
             batch=batch,
             rows=rows,
             started=np.array([started]),

@@ -508,10 +508,10 @@ class _QiuMethod(LoopedMethod, Generic[Step]):
         """Return the step graph."""
         return self.step.graph()
 
-    def begin(self, targets: TargetBatch, q0: Array) -> Start:
-        """Return initial states at q0, clipped to enforced limits."""
+    def begin(self, targets: TargetBatch) -> Start:
+        """Return initial states at the starts, clipped to enforced limits."""
         step, count = self.step, len(targets)
-        first = step.first_state(clip_starts(self.robot, targets, q0))
+        first = step.first_state(clip_starts(self.robot, targets))
         states = step.state.pack_rows(first, count)
         return states, step.parameters.pack_rows(step.parameter_values(targets), count)
 

@@ -106,17 +106,16 @@ class Searches:
         self._memory["hands"][:, side] = ctypes.cast(function, ctypes.c_void_p).value
         return references
 
-    def set_target(self, targets: TargetBatch, row: int, q0: Array, terms: Array) -> None:
+    def set_target(self, targets: TargetBatch, row: int, terms: Array) -> None:
         """Write a target to the arrays.
 
         Args:
             targets: k targets.
             row: Index of the target.
-            q0: (n,) start configuration.
             terms: Terms of the target.
         """
         self.points[...], self.normals[...] = targets.points[row], targets.normals[row]
-        self.q0[...], self.terms[...] = q0, terms
+        self.q0[...], self.terms[...] = targets.starts(self.plan.layouts.robot)[row], terms
         for vectors, name in zip(
             self.extra_vectors, self.plan.layouts.contacts.data[2:], strict=True
         ):
@@ -196,7 +195,6 @@ class Searches:
     def batch(
         self,
         targets: TargetBatch,
-        q0: Array,
         terms: Array,
         rounds: NDArray[np.int64],
         trace: bool,
@@ -205,12 +203,12 @@ class Searches:
 
         Args:
             targets: The targets.
-            q0: (k, n) start configurations.
             terms: Terms of the targets, (t,) or (k, t).
             rounds: (k,) maximum numbers of restarts.
             trace: Whether to keep every iteration.
         """
         plan, count = self.plan, len(targets)
+        q0 = targets.starts(plan.layouts.robot)
         data = plan.layouts.contacts.data
         extra_vectors = [targets.vectors(f"{name}s") for name in data[2:]]
         inputs = [

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,15 +15,14 @@ from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.trace import pack_mask
 
-SideSolver = Callable[[TargetBatch, Array], Outcome]
-"""Function that solves the targets of a side from start configurations (k, n) of the side."""
+SideSolver = Callable[[TargetBatch], Outcome]
+"""Function that solves the targets of a side."""
 
 
 def solve_sides_independently(
     robot: RobotDescription,
     solvers: Sequence[SideSolver],
     targets: TargetBatch,
-    q0: Array,
     phases: Sequence[str],
     record: np.dtype[Any] | None,
 ) -> Outcome:
@@ -34,11 +32,12 @@ def solve_sides_independently(
         robot: Description of the robot.
         solvers: Solvers of its sides.
         targets: k targets.
-        q0: (k, n) start configurations within bounds [rad or m].
         phases: Names of all phases, in order.
         record: Record type of the rows of a trace of the robot; None: no trace.
     """
-    count, q = len(targets), np.array(q0)
+    count, starts = len(targets), targets.starts(robot)
+    q = np.where(robot.continuous, starts, np.clip(starts, *targets.bounds(robot)))
+    targets = targets.starting_at(q)
     status = np.full(count, int(Status.SOLVED))
     iterations, restarts = np.zeros((2, count), dtype=np.int64)
     seconds = np.zeros(count)
@@ -52,8 +51,7 @@ def solve_sides_independently(
         rows = np.flatnonzero(has_contact)
         if not len(rows):
             continue
-        side_targets = select_side(targets.rows(rows), fingers, motors)
-        outcome = solve(side_targets, q[rows][:, motors])
+        outcome = solve(targets.rows(rows).for_part(fingers, motors))
         q_before = q[rows]
         q[rows[:, None], motors] = outcome.q
         is_worse = (status[rows] == Status.SOLVED) & (outcome.status != Status.SOLVED)
@@ -71,12 +69,6 @@ def solve_sides_independently(
         parts = [trace for target_traces in traces for trace in target_traces]
         all_rows = np.concatenate([np.empty(0, record), *parts])
     return Outcome(q, status, iterations, restarts, seconds, phase_counts, all_rows)
-
-
-def select_side(targets: TargetBatch, fingers: Sequence[int], motors: Sequence[int]) -> TargetBatch:
-    """Return the targets of the fingers of a side, for a robot with the motors of the side."""
-    fixed = None if targets.fixed is None else targets.fixed[..., motors]
-    return replace(targets.for_fingers(fingers), fixed=fixed)
 
 
 def robot_trace(

@@ -19,7 +19,7 @@ from casadi_ik.kinematics.arms.recognise import arm_family
 from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds
 from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.targets import TargetBatch
+from casadi_ik.model.targets import PREFERENCES, TargetBatch
 from casadi_ik.solve.hand_first.driver import Searches, SearchPool
 from casadi_ik.solve.hand_first.independent_sides import (
     SideSolver,
@@ -38,13 +38,9 @@ from casadi_ik.solve.limits import coupling_jacobian
 from casadi_ik.solve.looped_method import LoopedMethod, Start
 from casadi_ik.solve.method import HandSearch, Outcome, SingleOutcome
 from casadi_ik.solve.proofs.premises import ArmSpan, arm_span, palms_in_span
-from casadi_ik.solve.request import PREFERENCES
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import RecordedJacobian
 from casadi_ik.solve.verdict import judge
-
-Q0_PREFERENCE = "q0"
-"""Preference for the solution nearest to q0."""
 
 
 class HandFirstMethod(LoopedMethod):
@@ -193,28 +189,24 @@ class HandFirstMethod(LoopedMethod):
         """Maximum number of restarts of a search."""
         return self.options.all_rounds(self.robot)
 
-    def run(
-        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None = None
-    ) -> Outcome:
+    def run(self, targets: TargetBatch, trace: bool = False, rounds: int | None = None) -> Outcome:
         """Solve a batch with at most `rounds` restarts; see `Method.run`.
 
         No random numbers are drawn.
         """
-        outcome = self._run_contacts(targets, q0, seed, trace, rounds)
-        if targets.palms is None:
-            return outcome
-        return self._run_palms(targets, q0, outcome, seed, trace, rounds)
+        outcome = self._run_contacts(targets, trace, rounds)
+        return (
+            outcome if targets.palms is None else self._run_palms(targets, outcome, trace, rounds)
+        )
 
-    def _run_contacts(
-        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None
-    ) -> Outcome:
+    def _run_contacts(self, targets: TargetBatch, trace: bool, rounds: int | None) -> Outcome:
         """Solve a batch by its contacts; see `run`."""
         self._check(targets)
         if not self.is_compiled:
             method = self.in_virtual_machine() if self.robot.sides else self
-            return method._run_from_tables(targets, q0, trace, rounds)
+            return method._run_from_tables(targets, trace, rounds)
         if self._has_independent_sides:
-            return self._run_independent_sides(targets, q0, seed, trace, rounds)
+            return self._run_independent_sides(targets, trace, rounds)
         max_restarts = np.full(len(targets), self._max_restarts(targets))
         if rounds is not None:
             max_restarts = np.minimum(max_restarts, rounds)
@@ -222,24 +214,16 @@ class HandFirstMethod(LoopedMethod):
         if reachable is not None:
             max_restarts[~reachable] = 0  # the first restart alone ends near unreachable palms
         with self._searches.lent(targets.enforce_limits, len(targets)) as searches:
-            return searches.batch(targets, q0, self.terms(targets), max_restarts, trace)
+            return searches.batch(targets, self.terms(targets), max_restarts, trace)
 
     def _run_palms(
-        self,
-        targets: TargetBatch,
-        q0: Array,
-        outcome: Outcome,
-        seed: int,
-        trace: bool,
-        rounds: int | None,
+        self, targets: TargetBatch, outcome: Outcome, trace: bool, rounds: int | None
     ) -> Outcome:
         """Search for the palm poses that the search by contacts has missed.
 
         Args:
             targets: k targets with palm poses.
-            q0: (k, n) starts.
             outcome: The result of the search by contacts.
-            seed: See `run`.
             trace: See `run`.
             rounds: See `run`.
         """
@@ -251,7 +235,7 @@ class HandFirstMethod(LoopedMethod):
         arm = list(self.robot.arm_actuators)
         if len(rows) and arm:
             contacts = palm_contacts(self.robot, targets.rows(rows))
-            palms = self._palm_method.run(contacts, q0[rows][:, arm], seed, trace, rounds)
+            palms = self._palm_method.run(contacts, trace, rounds)
             q = outcome.q[rows]
             q[:, arm] = palms.q
             met = self._meets_palms(targets.rows(rows), q)
@@ -287,28 +271,27 @@ class HandFirstMethod(LoopedMethod):
         return HandFirstMethod(robot, self.options, self._compiled, PALM_KINDS)
 
     def _run_independent_sides(
-        self, targets: TargetBatch, q0: Array, seed: int, trace: bool, rounds: int | None
+        self, targets: TargetBatch, trace: bool, rounds: int | None
     ) -> Outcome:
         """Solve a multi-arm robot without a trunk."""
 
         def side_solver(side: HandFirstMethod) -> SideSolver:
-            return lambda side_targets, q: side.run(side_targets, q, seed, trace, rounds)
+            return lambda side_targets: side.run(side_targets, trace, rounds)
 
         return solve_sides_independently(
             self.robot,
             list(map(side_solver, self._sides)),
             targets,
-            np.where(self.robot.continuous, q0, np.clip(q0, *targets.bounds(self.robot))),
             self.step.layouts.labels,
             self.graph.record.dtype if trace else None,
         )
 
-    def solve_single(self, targets: TargetBatch, q0: Array) -> SingleOutcome | None:
-        """Solve one target from q0 (n,) as `run` does, but faster; None: use `run`."""
+    def solve_single(self, targets: TargetBatch) -> SingleOutcome | None:
+        """Solve one target as `run` does, but faster; None: use `run`."""
         if not self.is_compiled or self._has_independent_sides:
             return None
         with self._searches.lent(targets.enforce_limits) as search:
-            search.set_target(targets, 0, q0, self.terms(targets))
+            search.set_target(targets, 0, self.terms(targets))
             status = search(self._max_restarts(targets))
             return None if status is None else search.result(status)
 
@@ -317,13 +300,13 @@ class HandFirstMethod(LoopedMethod):
         self.prepare()
         return Searches(self.plan(enforce_limits), 1) if self._is_searchable else None
 
-    def stepper(self, targets: TargetBatch, q0: Array) -> Stepper:
+    def stepper(self, targets: TargetBatch) -> Stepper:
         """Return a stepper of one target, see `Method.stepper`."""
         self._check(targets)
         search, max_restarts = self.new_search(targets.enforce_limits), self._max_restarts(targets)
         if search is None:
-            return super().stepper(targets, q0)
-        search.set_target(targets, 0, q0, self.terms(targets).reshape(-1))
+            return super().stepper(targets)
+        search.set_target(targets, 0, self.terms(targets).reshape(-1))
 
         def next_restart(status: int, state: Array) -> Start | None:
             search.state[...] = state
@@ -346,44 +329,41 @@ class HandFirstMethod(LoopedMethod):
             table, row_count = self.seeds.table, (number + 1) * count
             return table.nearest(targets.points, targets.normals, row_count)[:, -count:]
         terms_by_row = np.broadcast_to(terms, (len(targets), terms.shape[-1]))
-        q0 = np.zeros(len(self.robot.actuators))
         with self._searches.lent(targets.enforce_limits) as search:
             seeds = np.empty((len(targets), *search.postures.shape))
             for row in range(len(targets)):
-                search.set_target(targets, row, q0, terms_by_row[row])
+                search.set_target(targets, row, terms_by_row[row])
                 seeds[row] = search.seeds(number)
         return seeds
 
-    def begin(self, targets: TargetBatch, q0: Array, number: int = 0) -> Start:
+    def begin(self, targets: TargetBatch, number: int = 0) -> Start:
         """Return states and parameters of a table restart.
 
         If the preference is q0, the hand of q0 is the first seed of the first restart.
         """
         postures = self.postures(targets, number)
-        nearest = targets.prefer == Q0_PREFERENCE and not number
-        if nearest and self.robot.arm_actuators and postures.shape[1] > 1:
-            start = np.clip(q0, *targets.bounds(self.robot))[:, None]
-            hand_of_q0 = start[:, :, list(self.robot.hand_actuators)]
+        is_near_q0 = targets.prefers_q0 and not number
+        if is_near_q0 and self.robot.arm_actuators and postures.shape[1] > 1:
+            starts = np.clip(targets.starts(self.robot), *targets.bounds(self.robot))[:, None]
+            hand_of_q0 = starts[:, :, list(self.robot.hand_actuators)]
             postures = np.concatenate([hand_of_q0, postures[:, :-1]], axis=1)
-        return self.rows(targets, q0, postures, skip_q0=number > 0)
+        return self.rows(targets, postures, skip_q0=number > 0)
 
-    def _run_from_tables(
-        self, targets: TargetBatch, q0: Array, trace: bool, rounds: int | None
-    ) -> Outcome:
+    def _run_from_tables(self, targets: TargetBatch, trace: bool, rounds: int | None) -> Outcome:
         """Solve a batch in the virtual machine, with table restarts of the unsolved targets."""
         layout, count = self.step.layouts.state, len(targets)
         status, iterations = np.zeros((2, count), dtype=np.int64)
         states, seconds = np.zeros((count, layout.size)), np.zeros(count)
         traces: list[list[NDArray[Any]]] = [[] for _ in range(count)]
         searches = [targets]
-        if targets.prefer == Q0_PREFERENCE:
+        if targets.prefers_q0:
             searches.append(replace(targets, prefer="limits"))
         max_restarts = min(self.rounds, self.options.rounds, rounds or self.rounds)
         for search_targets, number in product(searches, range(max_restarts)):
             unsolved = np.flatnonzero(status != Status.SOLVED)
             if not len(unsolved):
                 break
-            first, parameters = self.begin(search_targets.rows(unsolved), q0[unsolved], number)
+            first, parameters = self.begin(search_targets.rows(unsolved), number)
             if number:
                 for name in KEPT_ACROSS_RESTARTS:
                     first[:, layout.slice(name)] = states[unsolved, layout.slice(name)]
@@ -432,15 +412,13 @@ class HandFirstMethod(LoopedMethod):
         return candidates_before + np.clip(candidate, 0, self.options.candidates - 1)
 
     def rows(
-        self, targets: TargetBatch, q0: Array, postures: Array, skip_q0: bool = False
+        self, targets: TargetBatch, postures: Array, skip_q0: bool = False
     ) -> tuple[Array, Array]:
         """Return states and parameters (k, ...) of the loop for `run_rows`.
 
         Args:
-            targets: k targets.
-            q0: (k, n) start configurations [rad or m].
-            postures: (k, candidates, hand) seeds, or (k, 1, hand) [rad or m]. Motors that only move
-                free fingers stay at q0.
+            targets: k targets. Motors that only move free fingers stay at their start.
+            postures: (k, candidates, hand) seeds, or (k, 1, hand) [rad or m].
             skip_q0: Whether to skip the search for a solution near q0.
         """
         hand = len(self.step.layouts.robot.hand_actuators)
@@ -448,7 +426,8 @@ class HandFirstMethod(LoopedMethod):
         vectors = (targets.vectors(f"{name}s") for name in self.step.layouts.contacts.data)
         # Kernels take a column as a vector: the seeds of one motor have no second dimension.
         seeds = seeds.reshape(len(targets), *self.first.input_shapes[-1])
-        states, parameters = self.first(*vectors, q0, self.terms(targets), seeds)
+        starts = targets.starts(self.robot)
+        states, parameters = self.first(*vectors, starts, self.terms(targets), seeds)
         if skip_q0:
             layout = self.step.layouts.state
             states[:, layout.slice("phase")] = float(Phase.CANDIDATE)
@@ -474,7 +453,7 @@ class HandFirstMethod(LoopedMethod):
 
     def _compute_terms(self, targets: TargetBatch) -> Array:
         bounds = targets.bounds(self.robot)
-        nearest = np.array([float(targets.prefer == Q0_PREFERENCE)])
+        nearest = np.array([float(targets.prefers_q0)])
         fields = targets.position_tolerance, targets.angle_tolerance, *bounds, nearest
         if bounds[0].ndim == 1:
             return np.concatenate(fields)

@@ -64,5 +64,6 @@ def palm_contacts(robot: RobotDescription, targets: TargetBatch) -> TargetBatch:
         extra_vectors={"tangents": palms[:, None, :3, 1]},
         tolerance=targets.largest_tolerance,
         fixed=None if targets.fixed is None else targets.fixed[..., arm],
+        q0=None if targets.q0 is None else targets.q0[..., arm],
         palms=None,
     )

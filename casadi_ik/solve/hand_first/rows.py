@@ -25,7 +25,6 @@ from casadi_ik.solve.method import HandSearch
 def hand_rows(
     method: HandSearch,
     targets: TargetBatch,
-    q0: Array,
     postures: Array,
     palm_numbers: ArrayLike = 0.0,
 ) -> tuple[Array, Array]:
@@ -34,11 +33,10 @@ def hand_rows(
     Args:
         method: The method.
         targets: k targets.
-        q0: (k, n) start configurations [rad or m].
         postures: (k, hand) hand postures [rad or m].
         palm_numbers: (k,) numbers that select the palm pose where contacts leave the palm free.
     """
-    states, parameters = method.rows(targets, q0, postures[:, None], skip_q0=True)
+    states, parameters = method.rows(targets, postures[:, None], skip_q0=True)
     last = method.options.candidates - 1
     fields: dict[str, ArrayLike] = {"candidate": last, "palm_number": palm_numbers}
     if method.robot.sides:
@@ -56,7 +54,7 @@ def fit_hands_again(method: HandSearch, states: Array) -> None:
 def refinement_rows(method: HandSearch, targets: TargetBatch, q: Array) -> tuple[Array, Array]:
     """Return states and parameters of solves that refine all motors from q (k, n)."""
     hand = np.zeros((len(targets), len(method.robot.hand_actuators)))
-    states, parameters = hand_rows(method, targets, q, hand)
+    states, parameters = hand_rows(method, targets.starting_at(q), hand)
     start_refinement(method, states, q)
     return states, parameters
 
@@ -84,7 +82,7 @@ def palm_rows(
             a solve ends at q if some arm does not reach its palm pose.
     """
     hands = q[:, list(method.robot.hand_actuators)]
-    states, parameters = hand_rows(method, targets, q, hands)
+    states, parameters = hand_rows(method, targets.starting_at(q), hands)
     first_stages = np.where(places_arms, float(Stage.ARM_PLACEMENT), float(Stage.TRUNK))
     fields: dict[str, ArrayLike] = {
         "q": q,

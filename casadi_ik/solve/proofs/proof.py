@@ -88,7 +88,7 @@ class Proof:
             # The proof of a multi-arm robot is a proof for one of its sides.
             if set(self.fingers) <= set(side.fingers):
                 fingers = [robot.fingers.index(finger) for finger in side.fingers]
-                side_target = None if target is None else target.for_fingers(fingers)
+                side_target = None if target is None else target.for_part(fingers)
                 description = description.side(side.name, with_trunk=True)
                 break
         return self.seal == self._seal() and _is_confirmed(self, description, side_target)

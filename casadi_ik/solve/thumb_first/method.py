@@ -14,15 +14,12 @@ from casadi_ik.kinematics.arms.recognise import arm_family
 from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds, target_values
 from casadi_ik.kinematics.posture_table import PostureTable
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.targets import TargetBatch
+from casadi_ik.model.targets import Q0, TargetBatch
 from casadi_ik.solve.looped_method import LoopedMethod, Start
 from casadi_ik.solve.status import Phase
 from casadi_ik.solve.thumb_first.layouts import THUMB_FIRST_STAGES
 from casadi_ik.solve.thumb_first.parameters import ThumbFirstParameters
 from casadi_ik.solve.thumb_first.step import ThumbFirstStep
-
-PREFER_Q0 = "q0"
-"""Name of the preference for solutions near `q0`."""
 
 
 class ThumbFirstMethod(LoopedMethod):
@@ -34,7 +31,7 @@ class ThumbFirstMethod(LoopedMethod):
     """
 
     name = "thumb-first"
-    preferences: tuple[str, ...] = ("limits", PREFER_Q0)
+    preferences: tuple[str, ...] = ("limits", Q0)
     follows_closed_chain = True
     takes_free_contacts = True
     takes_fixed_actuators = True
@@ -86,13 +83,13 @@ class ThumbFirstMethod(LoopedMethod):
         """Build and compile the loop, and compute the table."""
         _ = self.kernel, self.table
 
-    def begin(self, targets: TargetBatch, q0: Array) -> Start:
+    def begin(self, targets: TargetBatch) -> Start:
         """Return initial states: q0 if it is preferred, then palm estimates."""
+        q0, prefers_q0 = targets.starts(self.robot), targets.prefers_q0
         count, step, max_starts = len(targets), self.step, self.options.starts
         lower, upper = targets.bounds(self.robot)
         hand = list(self.robot.hand_actuators)
         current = np.clip(q0, lower, upper)
-        prefers_q0 = targets.prefer == PREFER_Q0
         hands = self._hands(targets, current[:, hand], prefers_q0, max_starts)[:, :max_starts]
         postures = np.zeros((count, max_starts, len(hand)))
         postures[:, : hands.shape[1]] = hands

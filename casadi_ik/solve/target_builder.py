@@ -1,4 +1,4 @@
-"""Conversion of grasps, palm poses and arrays into targets; tolerances, limits and preferences.
+"""Conversion of grasps, palm poses and arrays into targets, with the defaults of a solver.
 
 A palm pose with a hand posture determines all contacts; pose components that the contacts leave
 free are constrained by tangents.
@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.errors import InputError, UnknownNameError, UnsupportedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.files.input_checks.units import warn_of_far_contacts, warn_of_wide_tolerance
@@ -22,35 +23,17 @@ from casadi_ik.kinematics.contact_batches import check_extra_vectors
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.model.pose import Free
-from casadi_ik.model.targets import DIRECTIONS_KEY, TargetBatch, fixed_array, target_arrays
-
-CLEARANCE = "clearance"
-"""Preference for solutions far from obstacles; requires a solver with a scene."""
-
-PREFERENCES = ("limits", "manipulability", "q0", CLEARANCE)
-"""Orders among solutions: distance from the limits, manipulability of the arm, distance to q0,
-clearance."""
-
-NO_PREFERENCE = "none"
-"""Preference of methods that return the first solution they find."""
-
-
-def resolve_preference(prefer: str | None, has_start: bool) -> str:
-    """Return the preference of a solve.
-
-    Args:
-        prefer: One of `PREFERENCES`, or None: "q0" with a start, else "limits".
-        has_start: Whether the caller passed a start.
-
-    Raises:
-        InputError: The preference is unknown.
-    """
-    if prefer is None:
-        return "q0" if has_start else "limits"
-    if prefer not in PREFERENCES:
-        raise InputError(f"prefer: found {prefer!r}, expected one of {', '.join(PREFERENCES)}")
-    return prefer
-
+from casadi_ik.model.targets import (
+    CLEARANCE,
+    DIRECTIONS_KEY,
+    NO_PREFERENCE,
+    PREFERENCES,
+    Q0,
+    TargetBatch,
+    fixed_array,
+    target_arrays,
+)
+from casadi_ik.solve.method import Method
 
 MIN_CONTACT_MOTION = 0.15
 """Singular value of the map from palm motions (rotation [rad], translation by `LENGTH`) to contacts
@@ -222,116 +205,235 @@ def merge_fixed(postures: Array, fixed: Array | None, actuators: Sequence[str]) 
 
 
 @dataclass(frozen=True, eq=False)
-class Request:
-    """Converter of grasps and arrays into targets, with the defaults of a solver.
+class TargetBuilder:
+    """Builder of targets from grasps, palm poses and arrays.
 
     Attributes:
         robot: The robot.
         tolerances: Tolerance by finger, in the robot's order.
         enforce_limits: Whether a solution has to be within the limits.
+        method: Method that solves the targets and decides which preferences are supported; None:
+            all of them are.
+        has_scene: Whether solutions are checked for collisions.
     """
 
     robot: ArmHand
     tolerances: Mapping[str, Tolerance]
-    enforce_limits: bool
+    enforce_limits: bool = True
+    method: Method | None = None
+    has_scene: bool = True
 
-    def of_arrays(
+    def from_arrays(
         self,
         points: ArrayLike,
         normals: ArrayLike,
-        fixed: Array | None,
+        extra_vectors: Mapping[str, ArrayLike | None] | None = None,
+        *,
         first_row: int = 0,
-        more: Mapping[str, ArrayLike | None] | None = None,
-        prefer: str = "limits",
+        fixed: Mapping[str, float] | None = None,
+        q0: ArrayLike | None = None,
+        prefer: str | None = None,
+        seed: int = 0,
     ) -> TargetBatch:
         """Return targets given as arrays.
 
         Args:
             points: (k, f, 3) contact points [m].
             normals: (k, f, 3) pad normals.
-            fixed: Positions of fixed actuators, see `TargetBatch`.
+            extra_vectors: (k, f, 3) further vectors by name, see `check_extra_vectors`, and
+                directions.
             first_row: Number of the first target.
-            more: (k, f, 3) further vectors by name, see `check_extra_vectors`, and directions.
-            prefer: Preference, see `TargetBatch`.
+            fixed: Positions of fixed actuators by name.
+            q0: (n,) or (k, n) start configurations; None: the robot's home.
+            prefer: One of `PREFERENCES`; None: "q0" with start configurations, else "limits".
+            seed: Seed of all random numbers, >= 0.
 
         Raises:
-            InputError: See `target_arrays` and `check_extra_vectors`.
+            InputError: An argument has a wrong shape or value, see `target_arrays`,
+                `check_extra_vectors` and `fixed_array`.
+            UnknownNameError: A fixed actuator does not exist.
+            UnsupportedError: The method does not support the preference.
         """
-        named = dict(more or {})
-        directions = named.pop(DIRECTIONS_KEY, None)
+        fixed_q, preference = self.fixed_vector(fixed), self.preference(prefer, q0 is not None)
+        vectors = dict(extra_vectors or {})
+        directions = vectors.pop(DIRECTIONS_KEY, None)
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
         warn_of_far_contacts(p, "points", self._base_travel)
-        tolerances = tuple(self.tolerances.values())
-        vectors = check_extra_vectors(named, p, n, first_row) if named else {}
         return TargetBatch(
-            p, n, tolerances, self.enforce_limits, first_row, fixed, vectors, prefer=prefer
+            p,
+            n,
+            self._default_tolerances,
+            self.enforce_limits,
+            first_row,
+            fixed_q,
+            check_extra_vectors(vectors, p, n, first_row) if vectors else {},
+            q0=self._starts(q0, len(p)),
+            prefer=preference,
+            seed=_checked_seed(seed),
         )
 
-    def of_named(
-        self,
-        arrays: Mapping[str, ArrayLike],
-        fixed: Array | None,
-        first_row: int = 0,
-        prefer: str = "limits",
+    def from_named_arrays(
+        self, arrays: Mapping[str, ArrayLike], first_row: int = 0, **options: Any
     ) -> TargetBatch:
-        """Return targets given as arrays by name, see `of_arrays`.
+        """Return targets given as arrays by name; for options and errors see `from_arrays`."""
+        vectors = dict(arrays)
+        points, normals = vectors.pop("points"), vectors.pop("normals")
+        return self.from_arrays(points, normals, vectors, first_row=first_row, **options)
 
-        Raises:
-            InputError: See `of_arrays`.
-        """
-        more = dict(arrays)
-        points, normals = more.pop("points"), more.pop("normals")
-        return self.of_arrays(points, normals, fixed, first_row, more, prefer)
-
-    def of_grasps(
+    def from_grasps(
         self,
         grasps: Sequence[Grasp],
-        fixed: Mapping[str, float] | None,
-        prefer: str = "limits",
-        free: bool = False,
+        *,
+        fixed: Mapping[str, float] | None = None,
+        q0: ArrayLike | None = None,
+        prefer: str | None = None,
+        seed: int = 0,
+        allow_free_pose: bool = False,
     ) -> TargetBatch:
         """Return the targets of grasps, which share the tolerances of the first one.
 
         Args:
             grasps: At least one grasp.
-            fixed: Positions of fixed actuators by name.
-            prefer: Preference, see `TargetBatch`.
-            free: Whether object poses may be `Free`.
+            fixed: See `from_arrays`.
+            q0: See `from_arrays`.
+            prefer: See `from_arrays`.
+            seed: See `from_arrays`.
+            allow_free_pose: Whether object poses may be `Free`.
 
         Raises:
-            InputError: An element is not a grasp, names a finger or a side that the robot does
-                not have, or see `fixed_vector`.
+            InputError: An element is not a grasp, or names a finger or a side that the robot does
+                not have; or see `from_arrays`.
+            UnknownNameError: A fixed actuator does not exist.
+            UnsupportedError: The method does not support the preference.
         """
-        fingers = self.robot.fingers
+        preference = self.preference(prefer, q0 is not None)
+        has_palms = False
         for grasp in grasps:
             if not isinstance(grasp, Grasp):
                 raise InputError(f"grasp: found {type(grasp).__name__}, expected a Grasp")
-        if not free and any(isinstance(grasp.object_pose, Free) for grasp in grasps):
-            raise InputError("object_pose: a Free pose is only supported by Solver.solve")
-        if len(self.robot.sides) == 1:
-            (side,) = self.robot.sides
-            grasps = [
-                grasp
-                if grasp.single_palm is None
-                else replace(grasp, palm={side: grasp.single_palm})
-                for grasp in grasps
-            ]
-        if any(isinstance(grasp.palm, Mapping) for grasp in grasps):
-            grasps, postures = self._replace_palms_by_contacts(grasps)
-            targets = self.of_grasps(grasps, None, prefer, free)
-            fixed_q = self.fixed_vector(fixed) if fixed else None
-            return replace(targets, fixed=merge_fixed(postures, fixed_q, self.robot.actuators))
-        if any(grasp.palm is not None for grasp in grasps):
-            return self._of_palm_grasps(grasps, fixed, prefer)
-        # The constructor of a contact has checked it.
-        arrays = [grasp.arrays(fingers) for grasp in grasps]
-        more = [grasp.more(fingers) for grasp in grasps]
-        contacts, tolerances = grasps[0].contacts, self._default_tolerances
-        if any(contact.tolerance for contact in contacts.values()):
-            tolerances = tuple(
-                (contacts[name].tolerance if name in contacts else None) or self.tolerances[name]
-                for name in fingers
+            if not allow_free_pose and isinstance(grasp.object_pose, Free):
+                raise InputError("object_pose: a Free pose is only supported by Solver.solve")
+            has_palms = has_palms or grasp.palm is not None
+        palms = postures = None
+        if has_palms:
+            grasps, palms, postures = self._resolve_palms(grasps)
+        if palms is None or postures is None:
+            points, normals, vectors = self._contact_arrays(grasps)
+        else:
+            points, normals, vectors = contacts_from_palms(self.robot, palms, postures)
+        fixed_q = self.fixed_vector(fixed) if fixed else None
+        if postures is not None:
+            fixed_q = merge_fixed(postures, fixed_q, self.robot.actuators)
+        return TargetBatch(
+            points,
+            normals,
+            self._tolerances_of(grasps[0]),
+            self.enforce_limits,
+            fixed=fixed_q,
+            extra_vectors=vectors,
+            q0=self._starts(q0, len(points)),
+            prefer=preference,
+            seed=_checked_seed(seed),
+            object=grasps[0].object,
+            object_pose=_object_poses(grasps),
+            palms=palms,
+        )
+
+    def from_palms(
+        self,
+        palms: Array,
+        postures: Array,
+        *,
+        fixed: Mapping[str, float] | None = None,
+        q0: ArrayLike | None = None,
+        prefer: str | None = None,
+        seed: int = 0,
+    ) -> TargetBatch:
+        """Return targets given as palm poses with hand postures: only the arm is unknown.
+
+        Args:
+            palms: (k, 4, 4) poses of the palm frame in the base frame.
+            postures: (k, n) postures as `hand_posture` returns them.
+            fixed: Positions of other fixed actuators by name.
+            q0: See `from_arrays`.
+            prefer: See `from_arrays`.
+            seed: See `from_arrays`.
+
+        Raises:
+            InputError: A motor of the hand is fixed; or see `from_arrays`.
+            UnknownNameError: A fixed actuator does not exist.
+            UnsupportedError: The method does not support the preference.
+        """
+        preference = self.preference(prefer, q0 is not None)
+        points, normals, vectors = contacts_from_palms(self.robot, palms, postures)
+        return TargetBatch(
+            points,
+            normals,
+            self._default_tolerances,
+            self.enforce_limits,
+            fixed=merge_fixed(postures, self.fixed_vector(fixed), self.robot.actuators),
+            extra_vectors=vectors,
+            q0=self._starts(q0, len(points)),
+            prefer=preference,
+            seed=_checked_seed(seed),
+            palms=palms,
+        )
+
+    def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
+        """Return a start configuration (n,); None: the robot's home.
+
+        Raises:
+            InputError: The start is not a single configuration.
+        """
+        start = self.robot.start(q0, name)
+        if start.ndim != 1:
+            raise InputError(f"{name}: found shape {start.shape}, expected ({len(start[0])},)")
+        return start
+
+    def _starts(self, q0: ArrayLike | None, count: int) -> Array:
+        """Return the start configurations (n,) or (k, n) of `count` targets.
+
+        Raises:
+            InputError: Wrong shape or numbers, or another number of rows than targets.
+        """
+        starts = self.robot.start(q0)
+        if starts.ndim == 2 and len(starts) != count:
+            raise InputError(
+                f"q0: found {len(starts)} rows for {count} targets, expected {count}, or one (n,)"
             )
+        return starts
+
+    def preference(self, prefer: str | None, has_start: bool) -> str:
+        """Return the preference of targets.
+
+        Raises:
+            InputError: The preference is unknown, or needs a scene.
+            UnsupportedError: The method does not support it.
+        """
+        preference = resolve_preference(prefer, has_start)
+        if preference == CLEARANCE and not self.has_scene:
+            raise InputError(f"prefer: {preference!r} needs a solver with a scene")
+        method = self.method
+        if method is None or preference in method.preferences:
+            return preference
+        if method.preferences:
+            raise UnsupportedError(
+                f"prefer: {preference!r} is not supported by method {method.name!r}; expected one "
+                f"of {', '.join(method.preferences)}"
+            )
+        if prefer is None:
+            return NO_PREFERENCE
+        raise UnsupportedError(
+            f"prefer: {prefer!r} is not supported by method {method.name!r}, which returns the "
+            "first solution it finds; expected None"
+        )
+
+    def _contact_arrays(self, grasps: Sequence[Grasp]) -> tuple[Array, Array, dict[str, Array]]:
+        """Return points, normals and further vectors (k, f, 3) of grasps with contacts."""
+        # The constructor of a contact has checked it.
+        fingers = self.robot.fingers
+        arrays = [grasp.arrays(fingers) for grasp in grasps]
+        vectors = [grasp.more(fingers) for grasp in grasps]
         # Adding a dimension is free; stacking takes as long as solving one grasp.
         points, normals = (
             (arrays[0][0][None], arrays[0][1][None])
@@ -339,32 +441,47 @@ class Request:
             else (np.array(vectors) for vectors in zip(*arrays, strict=True))
         )
         warn_of_far_contacts(points, grasps[0].name or "contacts", self._base_travel)
-        return TargetBatch(
-            points,
-            normals,
-            tolerances,
-            self.enforce_limits,
-            fixed=self.fixed_vector(fixed) if fixed else None,
-            extra_vectors=_stack_vectors(more, len(fingers)) if any(more) else {},
-            prefer=prefer,
-            object=grasps[0].object,
-            object_pose=_object_poses(grasps),
+        return points, normals, _stack_vectors(vectors, len(fingers)) if any(vectors) else {}
+
+    def _tolerances_of(self, grasp: Grasp) -> tuple[Tolerance, ...]:
+        """Return the tolerance of every finger for the contacts of a grasp."""
+        contacts = grasp.contacts
+        if not any(contact.tolerance for contact in contacts.values()):
+            return self._default_tolerances
+        return tuple(
+            (contacts[name].tolerance if name in contacts else None) or tolerance
+            for name, tolerance in self.tolerances.items()
         )
 
-    def _of_palm_grasps(
-        self, grasps: Sequence[Grasp], fixed: Mapping[str, float] | None, prefer: str
-    ) -> TargetBatch:
+    def _resolve_palms(
+        self, grasps: Sequence[Grasp]
+    ) -> tuple[Sequence[Grasp], Array | None, Array]:
+        """Return grasps with palms by side as grasps with contacts; others by palms and postures.
+
+        Returns:
+            The grasps; (k, 4, 4) palm poses, None for a multi-arm robot; (k, n) positions of the
+            motors of the hands, NaN for other motors.
+        """
+        sides = self.robot.sides
+        if len(sides) == 1:
+            grasps = [
+                grasp
+                if grasp.single_palm is None
+                else replace(grasp, palm={sides[0]: grasp.single_palm})
+                for grasp in grasps
+            ]
+        if any(isinstance(grasp.palm, Mapping) for grasp in grasps):
+            converted, postures = self._replace_palms_by_contacts(grasps)
+            return converted, None, postures
         palms = [grasp.single_palm for grasp in grasps if grasp.single_palm is not None]
         if len(palms) < len(grasps):
             raise InputError("grasps: found palms and contacts, expected the same in all")
-        if self.robot.description.sides:
-            names = ", ".join(side.name for side in self.robot.description.sides)
+        if sides:
             raise InputError(
-                f"palm: found one pose, expected one by side (palms in a file): {names}"
+                f"palm: found one pose, expected one by side (palms in a file): {', '.join(sides)}"
             )
         postures = stack_postures(self.robot, [grasp.posture for grasp in grasps])
-        targets = self.of_palms(np.stack(palms), postures, fixed, prefer)
-        return replace(targets, object=grasps[0].object, object_pose=_object_poses(grasps))
+        return grasps, checked_pose(np.stack(palms), "palms"), postures
 
     def _replace_palms_by_contacts(self, grasps: Sequence[Grasp]) -> tuple[list[Grasp], Array]:
         """Return grasps with contacts instead of palms by side, and their postures.
@@ -415,39 +532,6 @@ class Request:
         robot = self.robot.description
         return {side.name: ArmHand(robot.side(side.name)) for side in robot.sides}
 
-    def of_palms(
-        self,
-        palms: ArrayLike,
-        postures: Array,
-        fixed: Mapping[str, float] | None,
-        prefer: str = "limits",
-    ) -> TargetBatch:
-        """Return targets given as palm poses with hand postures: only the arm is unknown.
-
-        Args:
-            palms: (k, 4, 4) poses of the palm frame in the base frame.
-            postures: (k, n) postures as `hand_posture` returns them.
-            fixed: Positions of other fixed actuators by name.
-            prefer: Preference, see `TargetBatch`.
-
-        Raises:
-            InputError: The poses are not rigid, or a motor of the hand is fixed.
-        """
-        poses = checked_pose(palms, "palms")
-        points, normals, more = contacts_from_palms(self.robot, poses, postures)
-        fixed_q = self.fixed_vector(fixed) if fixed else None
-        fixed_q = merge_fixed(postures, fixed_q, self.robot.actuators)
-        return TargetBatch(
-            points,
-            normals,
-            self._default_tolerances,
-            self.enforce_limits,
-            fixed=fixed_q,
-            extra_vectors=more,
-            prefer=prefer,
-            palms=poses,
-        )
-
     @cached_property
     def _base_travel(self) -> float:
         """Total travel of the robot's linear motors [m]."""
@@ -463,16 +547,33 @@ class Request:
         robot = self.robot
         return fixed_array(fixed or {}, robot.actuators, *robot.description.motion_limits)
 
-    def start(self, q0: ArrayLike | None, name: str = "q0") -> Array:
-        """Return a start configuration (n,); None: the robot's home.
 
-        Raises:
-            InputError: The start is not a single configuration.
-        """
-        start = self.robot.start(q0, name)
-        if start.ndim != 1:
-            raise InputError(f"{name}: found shape {start.shape}, expected ({len(start[0])},)")
-        return start
+def resolve_preference(prefer: str | None, has_start: bool) -> str:
+    """Return the preference of a solve.
+
+    Args:
+        prefer: One of `PREFERENCES`, or None: "q0" with a start, else "limits".
+        has_start: Whether the caller passed a start.
+
+    Raises:
+        InputError: The preference is unknown.
+    """
+    if prefer is None:
+        return Q0 if has_start else "limits"
+    if prefer not in PREFERENCES:
+        raise InputError(f"prefer: found {prefer!r}, expected one of {', '.join(PREFERENCES)}")
+    return prefer
+
+
+def _checked_seed(seed: int) -> int:
+    """Return a seed as an integer.
+
+    Raises:
+        InputError: It is not an integer >= 0.
+    """
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"seed: found {seed!r}, expected an integer >= 0")
+    return int(seed)
 
 
 def _object_poses(grasps: Sequence[Grasp]) -> Array | None:
