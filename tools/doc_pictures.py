@@ -55,7 +55,7 @@ POST = {
 
 MODELS = Path(__file__).parents[1] / "models"
 
-GALLERIES = {"arms": (6, (150, 190)), "hands": (5, (180, 170)), "bodies": (4, (225, 260))}
+GALLERIES = {"arms": (7, (135, 175)), "hands": (5, (180, 170)), "bodies": (4, (225, 260))}
 """Number of columns and size of an image [pixels] of each gallery; folders of `models`."""
 
 HANDS_OF_BODIES = {"two_ur10e": "two_ur10e+robotiq_2f85"}

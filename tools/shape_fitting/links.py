@@ -73,7 +73,7 @@ def in_our_links(
             ):
                 holder[joint.child] = holder[joint.parent]
                 changed = True
-    found, missing = link_meshes(tree, list(holder), visual)
+    found, missing = link_meshes(tree, [link for link in holder if link not in excluded], visual)
     for line in missing:
         print("  ", line)
     parts: dict[str, list[IndexedMesh]] = {}
