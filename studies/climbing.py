@@ -146,7 +146,7 @@ def _random_steps(robot: ik.ArmHand, q: Array, rng: np.random.Generator) -> Arra
     ranges = robot.upper - robot.lower
     size = 10.0 ** rng.uniform(-4, 0, (len(q), 1))
     is_changed = rng.random(q.shape) < rng.uniform(0.1, 1, (len(q), 1))
-    moved = q + np.where(is_changed, rng.normal(0, 1, q.shape) * size * ranges, 0.0)
+    perturbed = q + np.where(is_changed, rng.normal(0, 1, q.shape) * size * ranges, 0.0)
     snapped = rng.random(q.shape) < 0.05
     ends = np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper)
-    return np.clip(np.where(snapped, ends, moved), robot.lower, robot.upper)
+    return np.clip(np.where(snapped, ends, perturbed), robot.lower, robot.upper)

@@ -118,10 +118,10 @@ def tolerance_of(text: str) -> ik.Tolerance:
 
 def tolerance_name(text: str) -> str:
     """Return a tolerance as text in convenient units."""
-    one = tolerance_of(text)
-    if one.position < 1e-4:
-        return f"{one.position:.2g} m, {one.angle:.2g} rad".replace("e-0", "e-")
-    return f"{1e3 * one.position:g} mm, {np.rad2deg(one.angle):.4g} deg"
+    tolerance = tolerance_of(text)
+    if tolerance.position < 1e-4:
+        return f"{tolerance.position:.2g} m, {tolerance.angle:.2g} rad".replace("e-0", "e-")
+    return f"{1e3 * tolerance.position:g} mm, {np.rad2deg(tolerance.angle):.4g} deg"
 
 
 @cache

@@ -119,11 +119,11 @@ class Cell:
         return self.count
 
 
-def draw_configurations(robot: ArmHand, count: int, near: bool, seed: int) -> np.ndarray:
+def draw_configurations(robot: ArmHand, count: int, is_near_limits: bool, seed: int) -> np.ndarray:
     """Draw (count, n) configurations within limits."""
     rng = np.random.default_rng(seed)
     part = rng.random((count, len(robot.lower)))
-    if near:
+    if is_near_limits:
         at_end = rng.random(part.shape) < 0.5
         part = np.where(at_end, np.where(part < 0.5, 0.02 * part, 1 - 0.02 * (1 - part)), part)
     return robot.lower + part * (robot.upper - robot.lower)
@@ -508,18 +508,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--parts", type=Path, default=Path("out/one_body"), help="results of parts")
     parser.add_argument("--out", type=Path, default=RESULTS / "one_body")
     options = parser.parse_args(arguments)
-    every, until = cells(options), time.monotonic() + 60 * options.minutes
-    run_parts(work_out, every, options.parts, jobs=options.jobs, until=until)
-    done, codes = read_parts(options.parts, every)
+    all_cells, until = cells(options), time.monotonic() + 60 * options.minutes
+    run_parts(work_out, all_cells, options.parts, jobs=options.jobs, until=until)
+    done, codes = read_parts(options.parts, all_cells)
     table, metrics = misses(done)
     parts = [INTRODUCTION, markdown_table(MISSES, table)] if table else []
     for task, table in TABLES.items():
-        rows = [row for cell, found in done if cell.task == task for row in found.get("rows", [])]
+        rows = [row for cell, result in done if cell.task == task for row in result.get("rows", [])]
         parts += [table.title, markdown_table(table.heads, rows)] if rows else []
-    if len(done) < len(every):
-        parts.append(f"Of {len(every):,} parts {len(done):,} are done so far.")
-    made = command(__file__, arguments)
-    parts += ["## Provenance", f"`{made}`", provenance({"one_body": codes})]
+    if len(done) < len(all_cells):
+        parts.append(f"Of {len(all_cells):,} parts {len(done):,} are done so far.")
+    run_by = command(__file__, arguments)
+    parts += ["## Provenance", f"`{run_by}`", provenance({"one_body": codes})]
     write_page("Several arms as one", parts, options.out)
     write_metrics(metrics, options.out / "metrics.json")
 

@@ -140,17 +140,17 @@ class TeleoperationNlp:
     """
 
     def __init__(self, robot: ArmHand, arm_motors: list[int], targets: dict[str, Array]) -> None:
-        self.robot, self.moved, self.targets = robot, arm_motors, targets
+        self.robot, self.moved_motors, self.targets = robot, arm_motors, targets
         x, last = ca.SX.sym("x", len(arm_motors)), ca.SX.sym("last", len(arm_motors))
         self.last = robot.home[arm_motors]
         q = ca.SX(robot.home)
         q[arm_motors] = x
-        links, asked = actuated(robot.description, q).kinematics.links, []
+        links, pose_parameters = actuated(robot.description, q).kinematics.links, []
         cost = 0.02 * ca.sumsqr(x) + 0.1 * ca.sumsqr(x - last)
         for side in robot.description.sides:
             pose = ca.SX.sym(side.name, 3, 4)
             palm = links[side.palm_link].at(side.palm_placement)
-            asked.append(ca.vec(pose))
+            pose_parameters.append(ca.vec(pose))
             turn = palm.rotation @ pose[:, :3].T
             axis = ca.vertcat(
                 turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
@@ -158,7 +158,7 @@ class TeleoperationNlp:
             length = ca.sqrt(ca.sumsqr(axis) + 1e-12)
             angle = ca.atan2(length, ca.trace(turn) - 1)
             cost += 50 * ca.sumsqr(palm.origin - pose[:, 3]) + ca.sumsqr(axis / length * angle)
-        nlp = {"x": x, "p": ca.vertcat(*asked, last), "f": cost}
+        nlp = {"x": x, "p": ca.vertcat(*pose_parameters, last), "f": cost}
         options = {"max_iter": 30, "tol": 1e-6, "print_level": 0, "sb": "yes"}
         self.solver = ca.nlpsol("nlp", "ipopt", nlp, {"print_time": False, "ipopt": options})
 
@@ -172,11 +172,11 @@ class TeleoperationNlp:
         solution = self.solver(
             x0=self.last,
             p=parameters,
-            lbx=robot.lower[self.moved],
-            ubx=robot.upper[self.moved],
+            lbx=robot.lower[self.moved_motors],
+            ubx=robot.upper[self.moved_motors],
         )
         q = robot.home.copy()
-        q[self.moved] = self.last = np.array(solution["x"]).ravel()
+        q[self.moved_motors] = self.last = np.array(solution["x"]).ravel()
         return q
 
 

@@ -48,7 +48,7 @@ ROBOTS = (*SHIPPED_AND_MADE, "ur5e+shadow")
 BLOCK = 2000
 """Reachable targets that are made with one seed."""
 
-BEYOND = 20.0, 10.0
+MIN_VIOLATION = 20.0, 10.0
 """What is impossible is so by this much more than the tolerance [mm, deg], as far as not asked."""
 
 BLIND = np.deg2rad(
@@ -112,7 +112,7 @@ class Part:
     number: int
     size: int
     seed: int
-    beyond: tuple[float, float] = BEYOND
+    beyond: tuple[float, float] = MIN_VIOLATION
 
     @property
     def path(self) -> Path:
@@ -254,14 +254,14 @@ def main(arguments: list[str] | None = None) -> None:
         "--beyond",
         type=float,
         nargs=2,
-        default=BEYOND,
+        default=MIN_VIOLATION,
         metavar=("MM", "DEG"),
         help="impossible is what is so by this much more than the tolerance",
     )
     parser.add_argument("--title", default="Proofs of UNREACHABLE", help="title of the report")
     options = parser.parse_args(arguments)
     options.beyond = tuple(options.beyond)
-    if options.beyond != BEYOND:  # other counts, which are not to be mixed
+    if options.beyond != MIN_VIOLATION:  # other counts, which are not to be mixed
         options.out = options.out / "beyond {:g} mm {:g} deg".format(*options.beyond)
     until = time.monotonic() + 60 * options.minutes
     run_parts(solve, parts(options), options.out, jobs=options.jobs, until=until)

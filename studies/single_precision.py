@@ -134,10 +134,11 @@ def main(arguments: list[str] | None = None) -> None:
             rows += how_often(name, (double, single), options.count)
     heads = ["robot", "tolerance", "start", "double", "single", "lost", "gained", "false"]
     text = INTRODUCTION.format(count=options.count, away=START_OFFSET)
-    lost, false = (sum(int(row[i].replace(",", "")) for row in rows) for i in (5, 7))
+    lost_count, false_count = (sum(int(row[i].replace(",", "")) for row in rows) for i in (5, 7))
+    count = options.count * len(rows)
     result = (
-        f"**Of {options.count * len(rows):,} reachable targets, single precision misses {lost:,} "
-        f"that double precision solves, and {false:,} of its solutions are wrong.**"
+        f"**Of {count:,} reachable targets, single precision misses {lost_count:,} that double "
+        f"precision solves, and {false_count:,} of its solutions are wrong.**"
     )
     parts = [result, text, markdown_table(heads, rows)]
     run_by = command(__file__, arguments)

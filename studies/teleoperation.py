@@ -180,7 +180,7 @@ class Tracking:
 
     error: Array
     rough: float
-    beyond: float
+    beyond_velocity: float
     seconds: Array
     cpu: float
 
@@ -201,8 +201,8 @@ def measure(
     rates = np.diff(q, axis=0) / period
     max_step = period * velocity / 0.25
     rough = float((np.abs(np.diff(rates, axis=0)) / max_step)[settled].max())
-    beyond = float((np.abs(rates) > 1.001 * velocity)[settled].any(axis=1).mean())
-    return Tracking(error.ravel(), rough, beyond, seconds[10:], cpu)
+    beyond_velocity = float((np.abs(rates) > 1.001 * velocity)[settled].any(axis=1).mean())
+    return Tracking(error.ravel(), rough, beyond_velocity, seconds[10:], cpu)
 
 
 def leaders(
@@ -242,7 +242,7 @@ def comparison_section(paths: int, count: int, period: float, share: float) -> l
         seconds = 1e6 * np.concatenate([run.seconds for run in runs])
         row = [keypoints, who, f"{np.median(error):.2f}", f"{np.quantile(error, 0.99):.1f}"]
         row += [f"{max(run.rough for run in runs):.2f}"]
-        row += [f"{100 * np.mean([run.beyond for run in runs]):.1f}"]
+        row += [f"{100 * np.mean([run.beyond_velocity for run in runs]):.1f}"]
         row += [f"{np.median(seconds):.0f}", f"{np.quantile(seconds, 0.99):.0f}"]
         rows.append([*row, f"{1e6 * np.mean([run.cpu for run in runs]):.0f}"])
     text = EXPLAINED.format(

@@ -304,8 +304,8 @@ def main(arguments: list[str] | None = None) -> None:
     heads += ["confirmed", "off, most [mm]", "closed"]
     names = ", ".join(Path(name).stem for name in options.objects)
     texts = {"objects": len(options.objects), "names": names, "limit": options.limit}
-    poses, without = (sum(int(row[i]) for row in rows) for i in (1, 2))
-    result = f"**Grasps are found for {poses - without:,} of {poses:,} object poses.**"
+    poses, failed = (sum(int(row[i]) for row in rows) for i in (1, 2))
+    result = f"**Grasps are found for {poses - failed:,} of {poses:,} object poses.**"
     parts = [result, INTRODUCTION.format(checked=CHECKED, **texts), markdown_table(heads, rows)]
     if len(done) < len(all_cells):
         parts.append(f"Of {len(all_cells):,} objects at poses {len(done):,} are done so far.")

@@ -431,7 +431,7 @@ class Hold:
         """Return whether the object stays when pulled by its weight along directions (k, 3)."""
         model, data = self.model, self.data
         body = model.body("thing").id
-        held = np.zeros(len(directions), dtype=bool)
+        is_held = np.zeros(len(directions), dtype=bool)
         for k, direction in enumerate(directions):
             mujoco.mj_setState(model, data, state, STATE_SPEC)
             mujoco.mj_forward(model, data)
@@ -447,11 +447,11 @@ class Hold:
                     break
             cosine = (np.trace(turn.T @ data.xmat[body].reshape(3, 3)) - 1) / 2
             rotation = np.arccos(np.clip(cosine, -1, 1))
-            held[k] = (
+            is_held[k] = (
                 np.linalg.norm(data.xipos[body] - start_position) < MAX_DISPLACEMENT
                 and rotation < MAX_ROTATION
             )
-        return held
+        return is_held
 
 
 def _frame(pose: np.ndarray) -> dict[str, Any]:
