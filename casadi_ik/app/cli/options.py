@@ -221,7 +221,7 @@ UNIT_OPTIONS = (
 GRASP = Option("GRASP", "name listed by `casadi-ik grasps`, or YAML file")
 ROBOT = Option(
     "--robot R",
-    "robot name or YAML file (default: the one of the input file)",
+    "robot name or YAML file (default: the robot of the input)",
 )
 REQUIRED_ROBOT = Option(
     "--robot R", "name listed by `casadi-ik robots`, or YAML file", required=True

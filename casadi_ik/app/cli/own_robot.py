@@ -56,7 +56,7 @@ POSE_TOLERANCE = 1e-9
         parse=opt.file_name(".yaml", ".yml"),
     ),
     Option("--tip LINK", "link of the arm that carries the hand"),
-    Option("--palm LINK...", "palm link (one per hand for a body)"),
+    Option("--palm LINK...", "palm link (one per hand of a multi-arm robot)"),
     Option(
         "--mount POSE...",
         "hand on the tip: x y z [m] roll pitch yaw [rad] (default: 0)",
@@ -75,16 +75,17 @@ def import_robot(args: Arguments) -> CommandResult:
       casadi-ik import arm.urdf hand.urdf --out my_robot.yaml --picture my_robot.png
       casadi-ik import arm.urdf hand.xml --mount 0 0 0.05 0 0 1.57 --out mine.yaml
       casadi-ik import whole_robot.urdf --palm left_palm --out my_robot.yaml
-      casadi-ik import humanoid.urdf --out my_humanoid.yaml    both hands, one body
+      casadi-ik import humanoid.urdf --out my_humanoid.yaml    two arms, one trunk
       casadi-ik import my_robot.yaml --picture my_robot.png    after a correction
       casadi-ik solve my_grasp.yaml --robot my_robot.yaml
 
-    Files are URDF, xacro (needs casadi-ik[robots]) or MJCF (needs casadi-ik[robots]); names
-    such as panda_description are looked up by robot_descriptions.
+    Files are URDF, xacro (needs casadi-ik[robots]) or MJCF (needs casadi-ik[robots]).
+    Names such as panda_description are looked up by robot_descriptions.
+
     The files do not state fingertips, position and normal of pads, thumb, palm and
     home configuration: these are guessed. Each guess is marked in the description,
     and --picture shows them. The description refers to the files. A file with several
-    arm-hands is described as one body with a trunk; motors that move no palm (legs,
+    arm-hands becomes a multi-arm robot with a trunk; motors that move no palm (legs,
     head) are locked.
 
     exit codes: 0 written, 1 --check found a difference, 2 bad input (no file is
@@ -378,15 +379,15 @@ def export(args: Arguments) -> CommandResult:
 
     DIR becomes a project with library, header, example, README, benchmark and a test
     of 1,000 targets. It needs only a C compiler (--target wasm: a browser or node),
-    and its answers are bit for bit those of this package. An earlier export in DIR
-    is replaced; any other folder that is not empty is refused.
+    and its solutions are bit for bit equal to those of this package. An earlier
+    export in DIR is replaced; any other folder that is not empty is refused.
 
-    With --single nothing is computed in double precision. Answers also pass the
-    double-precision check but may differ from those computed here; the test of the
-    project allows one missed target in a thousand. Robots with several arms cannot
-    combine it with --scene.
+    --single computes in single precision only. Solutions also pass the
+    double-precision check but may differ from those of this package; the test of the
+    project allows one missed target in a thousand. For robots with several arms,
+    --single excludes --scene.
 
-    With --scene a target is solved only if the robot does not collide. If an answer
+    With --scene a target is solved only if the robot does not collide. If a solution
     collides, other arm configurations and then other hand poses are examined.
 
     exit codes: 0 written, 2 bad input (nothing is written)
