@@ -1,0 +1,70 @@
+"""Commands `casadi-ik map` and `casadi-ik place-base`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casadi_ik.api import Solver
+from casadi_ik.app.cli import options as opt
+from casadi_ik.app.cli.inputs import load_robot_arg, located
+from casadi_ik.app.cli.options import Option
+from casadi_ik.app.cli.outputs import check_outputs, writing
+from casadi_ik.app.cli.table import Arguments, CommandResult, command
+from casadi_ik.app.report import fields, files, headline
+from casadi_ik.errors import MissingExtraError
+
+
+@command(
+    Option("ROBOT", "robot name or YAML file"),
+    Option(
+        "--region VALUES...",
+        "corners of the box: x y z x y z [m] (default: around the arm)",
+        parse=lambda words: opt.numbers(words, 6, "x y z x y z"),
+    ),
+    Option("--orientations N", "number of palm orientations", 32, opt.integer(1)),
+    Option("--resolution M", "distance of positions [m]", 0.05, opt.positive),
+    Option("--meaning exact|tolerance", "palm pose itself, or within the solver's tolerance"),
+    opt.LIMITS,
+    Option("--jobs N", "threads", 1, opt.integer(1)),
+    opt.out("MAP.npz", "output file of the map", opt.file_name(".npz", ".ply", ".parquet")),
+    opt.picture("--picture", "picture of three layers"),
+)
+def reach_map(args: Arguments) -> CommandResult:
+    """Map the palm poses that an arm can reach.
+
+    Examples:
+      casadi-ik map ur5e --out ur5e.npz --picture ur5e.png
+      casadi-ik map panda --region 0.2 -0.4 0 0.8 0.4 0.6 --resolution 0.02 --out panda.ply
+      casadi-ik map my_robot.yaml --orientations 96 --jobs 4 --out my.parquet
+
+    Every palm pose is REACHABLE (with joint positions as a witness, which forward
+    kinematics confirms), UNREACHABLE (refuted by interval arithmetic) or OPEN. For an
+    arm without an exact closed form, the solver searches witnesses within its
+    tolerance, and nothing is refuted. Collisions are not considered.
+
+    MAP.npz holds positions, rotations, code (0 OPEN, 1 REACHABLE, 2 UNREACHABLE) and q.
+    MAP.ply is a point cloud of the positions, coloured by the share of reachable
+    orientations. MAP.parquet has a row per palm pose.
+
+    exit codes: 0 done, 2 bad input
+    """
+    robot = load_robot_arg(args.robot)
+    outputs = {"--out": args.out, "--picture": args.picture}
+    check_outputs(outputs)
+    draw = None
+    if args.picture is not None:
+        with located("--picture", (MissingExtraError,)):
+            from casadi_ik.app.pictures import draw_reach_map as draw
+    region = None if args.region is None else np.reshape(args.region, (2, 3))
+    meaning = {"exact": "exact", "tolerance": "within tolerance"}.get(args.meaning)
+    reach = Solver(robot, limits=args.limits).reach_map(
+        region, args.orientations, args.resolution, meaning, jobs=args.jobs
+    )
+    save = {".npz": reach.save, ".ply": reach.to_ply, ".parquet": reach.to_parquet}
+    with writing(args.out, "--out"):
+        save[args.out.suffix](args.out)
+    if draw is not None:
+        draw(reach, args.picture)
+    title = headline(True, "MAP", f"of {robot.name}, {reach.meaning}")
+    counts = fields({name: f"{count:,}" for name, count in reach.counts.items()})
+    return CommandResult.of_parts(True, title, counts, *files(outputs))

@@ -1,0 +1,91 @@
+"""Reachability maps: verdicts, files, and input that is refused."""
+
+import numpy as np
+import pytest
+
+import casadi_ik as ik
+from casadi_ik.planning.reach.reach_map import ReachMap
+
+BOX = ([-0.9, -0.9, -0.2], [0.9, 0.9, 1.0])
+
+
+@pytest.fixture(scope="module")
+def solver():
+    return ik.Solver(ik.load_robot("ur5e"))
+
+
+@pytest.fixture(scope="module")
+def reach(solver):
+    return solver.reach_map(BOX, orientations=4, resolution=0.3)
+
+
+def test_every_reachable_cell_has_a_witness(solver, reach):
+    assert reach.meaning == "exact"
+    assert sum(reach.counts.values()) == reach.status.size
+    assert min(reach.counts["REACHABLE"], reach.counts["UNREACHABLE"]) > 50
+    for position in np.flatnonzero(reach.share > 0)[:20]:
+        reached = reach.status[position] == "REACHABLE"
+        palms = solver.robot.palm(reach.q[position][reached])
+        assert np.allclose(palms, reach.palms(position)[reached], rtol=0, atol=1e-10)
+    assert np.isnan(reach.q[reach.status != "REACHABLE"]).all()
+
+
+def test_palm_poses_are_decided_like_cells(solver, reach):
+    palms = np.concatenate([reach.palms(i) for i in range(0, len(reach.positions), 7)])
+    listed = solver.reach_map(palms, keep_q=False)
+    assert listed.q is None
+    assert listed.shape == ()
+    assert np.array_equal(listed.status[:, 0], reach.status[::7].ravel())
+
+
+def test_threads_give_the_same_map(solver, reach):
+    again = solver.reach_map(BOX, orientations=4, resolution=0.3, jobs=2)
+    assert np.array_equal(again.code, reach.code)
+    assert np.array_equal(again.q, reach.q, equal_nan=True)
+
+
+def test_maps_are_written_and_read(reach, tmp_path):
+    reach.save(tmp_path / "map.npz")
+    again = ReachMap.load(tmp_path / "map.npz")
+    assert (again.robot, again.meaning, again.shape) == (reach.robot, reach.meaning, reach.shape)
+    assert np.array_equal(again.code, reach.code)
+    reach.to_ply(tmp_path / "map.ply")
+    data = (tmp_path / "map.ply").read_bytes()
+    header, _, vertices = data.partition(b"end_header\n")
+    assert f"element vertex {(reach.share > 0).sum()}".encode() in header
+    assert len(vertices) == 19 * (reach.share > 0).sum()
+    positions, share = reach.slice("z", 0.4)
+    assert positions.shape[:2] == share.shape == reach.shape[:2]
+    (tmp_path / "text.npz").write_text("no map")
+    with pytest.raises(ik.errors.InputError, match=r"text\.npz"):
+        ReachMap.load(tmp_path / "text.npz")
+
+
+def test_an_arm_without_a_closed_form_has_witnesses_only():
+    solver = ik.Solver(ik.load_robot("xarm6"), compiled=False)
+    reach = solver.reach_map(([0.3, 0, 0.2], [0.6, 0.3, 0.5]), orientations=1, resolution=0.3)
+    assert reach.meaning == "within tolerance, sampled"
+    assert reach.counts["UNREACHABLE"] == 0
+    assert reach.counts["REACHABLE"] > 0
+    with pytest.raises(ik.errors.UnsupportedError, match="meaning"):
+        solver.reach_map(BOX, meaning="exact")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        ({"region": ([0, 0, 0], [1, 1, 0])}, "region"),
+        ({"region": [1.0, 2.0]}, "region"),
+        ({"region": BOX, "resolution": 1e-4}, "resolution"),
+        ({"region": BOX, "resolution": 0.0}, "resolution"),
+        ({"region": BOX, "orientations": 0}, "orientations"),
+        ({"region": BOX, "orientations": np.zeros((2, 4))}, "orientations"),
+        ({"region": BOX, "meaning": "roughly"}, "meaning"),
+    ],
+)
+def test_bad_input_is_refused(solver, arguments, name):
+    with pytest.raises(ik.errors.InputError, match=rf"^{name}: .*expected"):
+        solver.reach_map(**arguments)
+    if name == "region":
+        with pytest.raises(ik.errors.UnsupportedError, match="reach_map"):
+            ik.Solver(ik.load_robot("allegro_right")).reach_map(BOX)
