@@ -62,5 +62,5 @@ def test_palm_poses_move_with_the_object(solver):
     bounds = ik.Free([0, -0.02, 0, 0, 0, 0], [0.04, 0, 0, 0, 0, 0])
     solution = solver.solve(replace(at_origin, object_pose=bounds))
     assert solution.success
-    moved = solution.object_pose @ at_origin.palm
-    assert np.allclose(robot.palm(solution.q)[:3, 3], moved[:3, 3], atol=5e-3)
+    palm_at_object = solution.object_pose @ at_origin.palm
+    assert np.allclose(robot.palm(solution.q)[:3, 3], palm_at_object[:3, 3], atol=5e-3)

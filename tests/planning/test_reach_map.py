@@ -24,9 +24,9 @@ def test_every_reachable_cell_has_a_witness(solver, reach):
     assert sum(reach.counts.values()) == reach.status.size
     assert min(reach.counts["REACHABLE"], reach.counts["UNREACHABLE"]) > 50
     for position in np.flatnonzero(reach.share > 0)[:20]:
-        reached = reach.status[position] == "REACHABLE"
-        palms = solver.robot.palm(reach.q[position][reached])
-        assert np.allclose(palms, reach.palms(position)[reached], rtol=0, atol=1e-10)
+        is_reachable = reach.status[position] == "REACHABLE"
+        palms = solver.robot.palm(reach.q[position][is_reachable])
+        assert np.allclose(palms, reach.palms(position)[is_reachable], rtol=0, atol=1e-10)
     assert np.isnan(reach.q[reach.status != "REACHABLE"]).all()
 
 
@@ -39,16 +39,20 @@ def test_palm_poses_are_decided_like_cells(solver, reach):
 
 
 def test_threads_give_the_same_map(solver, reach):
-    again = solver.reach_map(BOX, orientations=4, resolution=0.3, jobs=2)
-    assert np.array_equal(again.code, reach.code)
-    assert np.array_equal(again.q, reach.q, equal_nan=True)
+    repeated = solver.reach_map(BOX, orientations=4, resolution=0.3, jobs=2)
+    assert np.array_equal(repeated.code, reach.code)
+    assert np.array_equal(repeated.q, reach.q, equal_nan=True)
 
 
 def test_maps_are_written_and_read(reach, tmp_path):
     reach.save(tmp_path / "map.npz")
-    again = ReachMap.load(tmp_path / "map.npz")
-    assert (again.robot, again.meaning, again.shape) == (reach.robot, reach.meaning, reach.shape)
-    assert np.array_equal(again.code, reach.code)
+    repeated = ReachMap.load(tmp_path / "map.npz")
+    assert (repeated.robot, repeated.meaning, repeated.shape) == (
+        reach.robot,
+        reach.meaning,
+        reach.shape,
+    )
+    assert np.array_equal(repeated.code, reach.code)
     reach.to_ply(tmp_path / "map.ply")
     data = (tmp_path / "map.ply").read_bytes()
     header, _, vertices = data.partition(b"end_header\n")
