@@ -1,10 +1,10 @@
-"""The cache folder of compiled libraries, and the check that it can be trusted.
+"""Cache folder of compiled libraries, and the check that it can be trusted.
 
-A library is loaded into the process, so whoever can write one can run code as the user. A folder is
-trusted if it and every parent belong to the user or to root and nobody else can write into them. A
-parent may be sticky (/tmp), since only owners can move what it contains. The check resolves
-symbolic links, and only the resolved path is used afterwards. Systems without file owners (Windows)
-keep caches in the user's profile, where nothing is checked.
+Libraries are loaded into the process: a user who can write a library can run code in it. A folder
+is trusted if it and all its parents belong to the user or to root, and other users cannot write
+into them. A parent may be sticky (/tmp), because only owners can move its entries. The check
+resolves symbolic links, and only the resolved path is used afterwards. Systems without file owners
+(Windows) keep caches in the profile of the user, without a check.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from pathlib import Path
 
 
 class CacheWarning(RuntimeWarning):
-    """The cache folder cannot be used; compiled kernels are kept in a temporary folder."""
+    """Warning that the cache folder cannot be used; kernels are stored in a temporary folder."""
 
 
 _warned: set[str] = set()
 
 
 def cache_directory() -> Path:
-    """Return the cache folder, whether it can be used or not.
+    """Return the path of the cache folder, which may be unusable.
 
     It is `CASADI_IK_CACHE`, otherwise `casadi_ik` in `XDG_CACHE_HOME`, otherwise in the cache
     folder of the platform (`~/.cache`, `~/Library/Caches`, `%LOCALAPPDATA%`), otherwise a temporary
     folder.
 
     Raises:
-        OSError: The path is relative and the working directory is gone, or there is no temporary
-            folder.
+        OSError: The path is relative and the working directory is missing, or there is no
+            temporary folder.
     """
     if configured := os.environ.get("CASADI_IK_CACHE"):
         return Path(configured).absolute()
@@ -58,26 +58,26 @@ def trusted_cache() -> Path | None:
 
     A folder that can be read but not written can be used.
     """
-    where = "the folder for compiled kernels"
+    location = "the folder for compiled kernels"
     try:
         directory = cache_directory()
-        where = str(directory)
+        location = str(directory)
         _make_private(directory)
         real = Path(os.path.realpath(directory, strict=True))
         problem = untrusted_reason(real)
         if not problem:
-            # One entry is enough: the cache may hold tens of thousands of files.
+            # Read only one entry: the cache may have tens of thousands of files.
             with os.scandir(real) as entries:
                 next(entries, None)
             return real
     except (OSError, ValueError) as error:
         problem = f"cannot be used: {os_reason(error)}"
-    warn_once(where, problem)
+    warn_once(location, problem)
     return None
 
 
 def user_temp_dir() -> Path:
-    """Create and return the user's private folder for temporary files.
+    """Create and return the private folder of the user for temporary files.
 
     Raises:
         OSError: The folder cannot be created, or other users could write into it.
@@ -91,14 +91,14 @@ def user_temp_dir() -> Path:
     return real
 
 
-def warn_once(where: str, problem: str) -> None:
-    """Warn once per process that a folder cannot keep compiled kernels."""
-    if where in _warned:
+def warn_once(location: str, problem: str) -> None:
+    """Warn once per process that compiled kernels cannot be stored in a folder."""
+    if location in _warned:
         return
-    _warned.add(where)
+    _warned.add(location)
     warnings.warn(
-        f"{where[:200]}: {problem}; kernels are kept among temporary files "
-        "(CASADI_IK_CACHE names another folder)",
+        f"{location[:200]}: {problem}; kernels are stored in a temporary folder "
+        "(set CASADI_IK_CACHE to another folder)",
         CacheWarning,
         stacklevel=2,
     )
@@ -110,7 +110,7 @@ def os_reason(error: Exception) -> str:
 
 
 def untrusted_reason(real: Path) -> str:
-    """Return why a folder cannot be trusted, "" if it can.
+    """Return the reason why a folder cannot be trusted; "" for a trusted folder.
 
     Args:
         real: An absolute path without symbolic links.
@@ -122,16 +122,16 @@ def untrusted_reason(real: Path) -> str:
         return ""
     for folder in (real, *real.parents):
         info = folder.lstat()
-        where = "" if folder == real else f"{folder} "
+        prefix = "" if folder == real else f"{folder} "
         if not stat.S_ISDIR(info.st_mode):
-            return f"{where}is not a folder"
+            return f"{prefix}is not a folder"
         if problem := _other_writers(info, sticky=folder != real):
-            return f"{where}{problem}"
+            return f"{prefix}{problem}"
     return ""
 
 
 def is_private_file(path: Path) -> bool:
-    """Return True for a regular file of the user or root that nobody else can write."""
+    """Return True for a regular file of the user or root that other users cannot write."""
     try:
         info = path.lstat()
     except (OSError, ValueError):
@@ -144,7 +144,7 @@ def _has_owners() -> bool:
 
 
 def _other_writers(info: os.stat_result, sticky: bool) -> str:
-    """Return who else could change a file or folder, "" for nobody.
+    """Return which other users could change a file or folder; "" for none.
 
     Args:
         info: Status of the file or folder.
@@ -162,16 +162,16 @@ def _other_writers(info: os.stat_result, sticky: bool) -> str:
 
 @cache
 def _is_overflow_owner(owner: int) -> bool:
-    """Return True for the user id that a container shows for unmapped owners, root among them.
+    """Return True for the user id that a container shows for unmapped owners, including root.
 
-    Parent folders of such owners (/, /home) are taken for the system's own.
+    Parent folders of such owners (/, /home) count as folders of the system.
     """
     try:
-        nobody = int(Path("/proc/sys/kernel/overflowuid").read_text(encoding="ascii"))
+        overflow_owner = int(Path("/proc/sys/kernel/overflowuid").read_text(encoding="ascii"))
         mapped = Path("/proc/self/uid_map").read_text(encoding="ascii").split()
     except (OSError, ValueError):
         return False
-    return owner == nobody and mapped != ["0", "0", str(2**32 - 1)]
+    return owner == overflow_owner and mapped != ["0", "0", str(2**32 - 1)]
 
 
 def _is_private_group(info: os.stat_result) -> bool:
@@ -191,7 +191,7 @@ def _make_private(directory: Path) -> None:
     missing = []
     while not directory.is_dir():
         if directory.is_symlink() or directory.exists():
-            raise NotADirectoryError(errno.ENOTDIR, "a file is in the way", str(directory))
+            raise NotADirectoryError(errno.ENOTDIR, "a file has this path", str(directory))
         missing.append(directory)
         directory = directory.parent
     for folder in reversed(missing):
@@ -202,7 +202,7 @@ def _make_private(directory: Path) -> None:
 def temporary_build_dir(directory: Path) -> Iterator[Path]:
     """Create a folder for the files of one compilation, and remove it afterwards.
 
-    Only this block removes it, so that a forked child that exits meanwhile does not.
+    Only this block removes the folder; a forked child that exits earlier does not.
 
     Raises:
         OSError: The folder cannot be created.

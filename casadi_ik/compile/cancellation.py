@@ -125,7 +125,7 @@ class DriverCode(IntEnum):
     DONE = 0
     SLICE_OVER = 1
     ROWS_FULL = 2
-    GOES_ON = 3
+    CONTINUES = 3
     FEW_LEFT = 4
     NO_MEMORY = -1
 

@@ -44,8 +44,8 @@ def c_struct(name: str, sizes: Mapping[str, int] | None = None, driver: str = ""
     for declaration in filter(str.strip, body.split(";")):
         if declaration.strip().isupper():
             continue  # a macro for fields of a standalone solver
-        if called := re.search(r"(?:\(\*|KERNEL\()(\w+)", declaration):
-            fields.append((called[1], ctypes.c_void_p))
+        if callback := re.search(r"(?:\(\*|KERNEL\()(\w+)", declaration):
+            fields.append((callback[1], ctypes.c_void_p))
             continue
         kind: Any = ctypes.c_double if "scalar" in declaration else ctypes.c_int64
         for name in declaration.split(","):
@@ -129,13 +129,13 @@ def type_definitions(options: CodeOptions) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Stages:
-    """An iteration whose control flow is C: the functions that it calls, and its text.
+    """Iteration with control flow in C: the functions that it calls, and its text.
 
     Attributes:
         functions: Functions of dense vectors by enum member; the text calls them by member name.
         text: C code that defines ``iterate(real *state, const real *parameters, const scalar *const
-            *own, real *state_after, real *record, real *status, int wanted)``. `own` holds the
-            parameters of each lane; `record` may be NULL.
+            *own, real *state_after, real *record, real *status, int active_lanes)``. `own` holds
+            the parameters of each lane; `record` may be NULL.
     """
 
     functions: Mapping[Any, ca.Function]
@@ -144,38 +144,38 @@ class Stages:
     def source(self, options: CodeOptions) -> str:
         """Return the C code of the stages and the macro `STEP`."""
         text, names = emit(list(self.functions.values()), options)
-        lane_argument = ", wanted" if options.lanes > 1 else ""
+        lane_argument = ", active_lanes" if options.lanes > 1 else ""
         calls = "".join(
             f"#define {stage.name}(...) {name}(__VA_ARGS__{lane_argument})\n"
             for stage, name in zip(self.functions, names, strict=True)
         )
         arguments = "(real *) (arg)[0], (arg)[1], (const scalar *const *) (arg)[2]"
-        step = f"iterate({arguments}, (res)[0], (res)[1], (res)[2], wanted)"
+        step = f"iterate({arguments}, (res)[0], (res)[1], (res)[2], active_lanes)"
         return (
             text
             + calls
             + self.text
-            + f"#define STEP(arg, res, wanted) {step}\n"
+            + f"#define STEP(arg, res, active_lanes) {step}\n"
             + define({"STEP_IN": 2, "STEP_OUT": 3, "STEP_STAGES": len(self.functions)})
         )
 
 
 MAX_GRAPH_STAGES = 12
-"""Number of queues in the loop for a step that is one graph, whose stages cannot be counted."""
+"""Number of queues in the loop for a step that is one graph with an unknown number of stages."""
 
 
 def step_source(function: ca.Function | Stages, options: CodeOptions) -> str:
-    """Return the C code of a function and the macro `STEP(arg, res, wanted)` that calls it."""
+    """Return the C code of a function, and the macro `STEP(arg, res, active_lanes)` for calls."""
     if isinstance(function, Stages):
         return function.source(options)
     text, (name,) = emit([function], options)
     n_in, n_out = function.n_in(), function.n_out()
     arguments = [*(f"(arg)[{i}]" for i in range(n_in)), *(f"(res)[{i}]" for i in range(n_out))]
-    lane_mask = ["wanted"] if options.lanes > 1 else []
+    lane_mask = ["active_lanes"] if options.lanes > 1 else []
     return "".join(
         (
             text,
-            f"#define STEP(arg, res, wanted) {name}({', '.join(arguments + lane_mask)})\n",
+            f"#define STEP(arg, res, active_lanes) {name}({', '.join(arguments + lane_mask)})\n",
             define({"STEP_IN": n_in, "STEP_OUT": n_out, "STEP_STAGES": MAX_GRAPH_STAGES}),
         )
     )
@@ -245,14 +245,14 @@ def numbers(values: Iterable[Any]) -> str:
 def define_arrays(arrays: Mapping[str, NDArray[Any]], scope: str = "static const") -> str:
     """Return definitions of C arrays of type `scalar`, `int16_t` or `int`, by name.
 
-    C has no empty arrays: a dimension of zero becomes one, and the array holds zeros.
+    C has no empty arrays: a dimension of zero becomes one, and the array contains zeros.
     """
     text = ""
     for name, array in arrays.items():
         if not array.size:
             array = np.zeros([max(size, 1) for size in array.shape], array.dtype)
-        whole = "int16_t" if array.dtype == np.int16 else "int"
-        kind = whole if array.dtype.kind in "iu" else "scalar"
+        integer_type = "int16_t" if array.dtype == np.int16 else "int"
+        kind = integer_type if array.dtype.kind in "iu" else "scalar"
         sizes = "".join(f"[{size}]" for size in array.shape)
         text += f"{scope} {kind} {name}{sizes} = {numbers(array)};\n"
     return text

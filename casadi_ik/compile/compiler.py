@@ -21,14 +21,14 @@ from casadi_ik.compile.cancellation import SLICE, stop_if_cancelled
 from casadi_ik.errors import KernelError
 from casadi_ik.files.progress import is_terminal
 
-# Without contraction: fused multiply-adds would change iterates against the virtual machine. errno
-# of math functions is never read; without it sqrt is one instruction with the same result. All
-# symbols but the entry points are hidden, so that they cannot replace functions of libc.
+# No contraction: fused multiply-adds would change iterates compared with the virtual machine. errno
+# of math functions is not read; without it, sqrt is one instruction with the same result. All
+# symbols except entry points are hidden, so that they cannot replace functions of libc.
 FLAGS = ("-fPIC", "-shared", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden")
 
 LEVEL = ("-O2",)
-"""Optimization level. With -O1 compiling takes three quarters of the time and `fast` 6 to 8 %
-longer; results are the same bit for bit."""
+"""Optimization level. With -O1, compilation takes 75 % of the time and `fast` is 6 to 8 % slower;
+results are the same bit for bit."""
 
 CANDIDATES = ("cc", "gcc", "clang")
 
@@ -45,7 +45,7 @@ MIN_FREE_BYTES = 2**20
 
 
 class NoCompilerWarning(RuntimeWarning):
-    """There is no C compiler: kernels run in CasADi's virtual machine, 20 to 60 times slower."""
+    """Warning that kernels run in CasADi's virtual machine for lack of a compiler, and are slow."""
 
 
 class UnloadableError(KernelError):
@@ -76,7 +76,7 @@ class Compiler:
 
         Args:
             source: Path of the C file.
-            library: Path of the library; temporary files of the compiler are put beside it.
+            library: Path of the library; temporary files of the compiler are in the same folder.
 
         Raises:
             KernelError: Compiling failed; the message has the first lines of the compiler's errors.
@@ -97,16 +97,16 @@ class Compiler:
         if _disk_is_full(library.parent, done.stderr):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(library.parent))
         lines = done.stderr.splitlines()
-        errors = [line for line in lines if "error" in line.lower()] or lines or ["no complaint"]
+        errors = [line for line in lines if "error" in line.lower()] or lines or ["no message"]
         complaint = "; ".join(line[:SHOWN_CHARACTERS] for line in errors[:SHOWN_ERROR_LINES])
         ended = (
             f"failed with {_describe_exit(done.returncode)}"
             if done.returncode
-            else "made no library"
+            else "produced no library"
         )
         raise KernelError(
             f"compiler {self} {ended} "
-            f"(CC=... names another compiler, CC=none does without): {complaint}"
+            f"(set CC to another compiler, or CC=none to use none): {complaint}"
         )
 
     def __str__(self) -> str:
@@ -129,13 +129,13 @@ def _run(
         try:
             while True:
                 with contextlib.suppress(subprocess.TimeoutExpired):
-                    out, complaint = process.communicate(timeout=SLICE)
+                    output, complaint = process.communicate(timeout=SLICE)
                     break
                 stop_if_cancelled()
         except BaseException:
             process.kill()
             raise
-    return subprocess.CompletedProcess(command, process.returncode, out, complaint)
+    return subprocess.CompletedProcess(command, process.returncode, output, complaint)
 
 
 def _describe_exit(code: int) -> str:
@@ -156,10 +156,9 @@ def _disk_is_full(directory: Path, complaint: str) -> bool:
 def find_compiler() -> Compiler | None:
     """Return the compiler of the environment; None if there is none.
 
-    The environment variable `CC` (command and arguments) counts alone if it is set; otherwise the
-    first of cc, gcc, clang on the path, then the Python package ziglang (extra `compiler`). A `CC`
-    that does not exist (`CC=none`) is a way to ask for the virtual machine. `CASADI_IK_CFLAGS` is
-    appended to the flags.
+    If the environment variable `CC` (command and arguments) is set, only it is tried; otherwise cc,
+    gcc and clang on the path, then the Python package ziglang (extra `compiler`). A `CC` that does
+    not exist (`CC=none`) selects the virtual machine. `CASADI_IK_CFLAGS` is appended to the flags.
     """
     return _find_cached(
         os.environ.get("CC", ""),
@@ -236,7 +235,7 @@ def warn_no_compiler(problem: str = "") -> None:
     if _warned:
         return
     _warned = True
-    found = problem or (
+    reason = problem or (
         f"CC={os.environ['CC'][:SHOWN_CHARACTERS]!r} does not run{_quotation_hint()}"
         if os.environ.get("CC", "").strip()
         else (
@@ -245,7 +244,7 @@ def warn_no_compiler(problem: str = "") -> None:
         )
     )
     warnings.warn(
-        f"no C compiler ({found}): casadi_ik runs in CasADi's virtual machine, with the same "
+        f"no C compiler ({reason}): casadi_ik runs in CasADi's virtual machine, with the same "
         "results but about 20 times slower, batches 60 times",
         NoCompilerWarning,
         stacklevel=2,
@@ -271,14 +270,14 @@ def waits_for_compiler() -> bool:
 
 
 def print_note(text: str) -> None:
-    """Write a line on what is compiled to stderr; if the caller waits for it, to terminals only."""
+    """Write a line about a compilation to stderr; to terminals only if the caller waits for it."""
     stream = sys.stderr
     if stream is not None and (not waits_for_compiler() or is_terminal(stream)):
         print(text, file=stream, flush=hasattr(stream, "flush"))
 
 
 def announce(name: str, size: int) -> None:
-    """Print what is compiled and the expected time, if that is more than 2 s.
+    """Print the name of a kernel and its expected compile time, if that exceeds 2 s.
 
     Args:
         name: Name of the kernel.

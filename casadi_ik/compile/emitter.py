@@ -1,7 +1,7 @@
 """C code from CasADi Functions.
 
-`emit` walks the instructions of a Function and of all it calls and writes one C function for each,
-callees first. The text is the same for one number at a time, for vectors and for single precision:
+`emit` reads the instructions of a Function and of all Functions that it calls, and writes one C
+function for each, callees first. The text is the same for scalars, vectors and single precision:
 the C text before it defines `real`, `mask` and `real_sin` (`runtime/real.c`, `runtime/lanes.c`,
 `runtime/elementary_single.c`).
 
@@ -9,10 +9,10 @@ the C text before it defines `real`, `mask` and `real_sin` (`runtime/real.c`, `r
 - An MX Function becomes a list of calls, with arrays on the stack between them.
 - A Map calls a Function for each of its columns.
 - A Switch calls one of several Functions. With several lanes it calls each branch that any lane
-  takes, and every lane keeps the results of its branch.
+  takes, and every lane stores the results of its branch.
 
-Other Functions are expanded into SX. Functions that differ in constants alone, such as those of a
-left and a right arm, share one C function, with a table of constants each.
+Other Functions are expanded into SX. Functions that differ in constants only, such as those of
+a left and a right arm, share a C function, with a table of constants for each.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ def emit(functions: Sequence[ca.Function], options: CodeOptions) -> tuple[str, l
 
     Returns:
         The text, and the names of the functions in C: `static void name(const real *i0, ...,
-        real *o0, ...)`; some are macros. With several lanes, `int wanted` follows: a bit for each
-        lane whose results are needed. The nonzeros of an output are written unless its pointer is
-        NULL; the pointer of the first output never is.
+        real *o0, ...)`; some are macros. With several lanes, `int active_lanes` follows: a bit for
+        each lane whose results are needed. The nonzeros of an output are written unless its pointer
+        is NULL; the pointer of the first output never is.
 
     Raises:
         KernelError: A function contains an operation without C code, such as a Python callback.
@@ -64,7 +64,7 @@ def emit(functions: Sequence[ca.Function], options: CodeOptions) -> tuple[str, l
 
 
 VARYING_PART = re.compile(r"\bR\((-?[0-9][^()]*)\)|\b(f[0-9]+_\w+)\(")
-"""A constant or a callee: the parts in which functions of one group may differ."""
+"""Pattern of a constant or a callee, the parts in which functions of a group may differ."""
 
 
 class _CFunction(NamedTuple):
@@ -77,7 +77,7 @@ class _CFunction(NamedTuple):
 
 
 class _Emitter:
-    """Writer of C functions, each once."""
+    """Writer of C functions; writes each function once."""
 
     def __init__(self, options: CodeOptions) -> None:
         self.options = options
@@ -95,7 +95,7 @@ class _Emitter:
             inputs = [f"i{i}" for i in range(function.n_in())]
             outputs = [f"o{i}" for i in range(function.n_out())]
             parameters = [f"const real *{i}" for i in inputs] + [f"real *{o}" for o in outputs]
-            head = ", ".join(parameters + (["int wanted"] if self.options.lanes > 1 else []))
+            head = ", ".join(parameters + (["int active_lanes"] if self.options.lanes > 1 else []))
             unused = ", ".join(f"(void) {x}" for x in inputs + outputs)
             self._write(name, head, f"  {unused};\n{body}")
         return self._names[key][0]
@@ -117,17 +117,17 @@ class _Emitter:
             groups[function.group].append(function)
         tables: dict[CName, list[str]] = {}
         codes = [self._group_code(index, group, tables) for index, group in enumerate(groups)]
-        called = {
+        used_names = {
             *entry_points,
             *(name for code in codes for _, name in VARYING_PART.findall(code)),
         }
         texts = []
         for index, (code, group) in enumerate(zip(codes, groups, strict=True)):
             texts.append(code)
-            for name in (f.name for f in group if tables[f.name] and f.name in called):
+            for name in (f.name for f in group if tables[f.name] and f.name in used_names):
                 texts += [
                     f"static const scalar of_{name}[]={{{','.join(tables[name])}}};\n",
-                    f"#define {name}(...) alike{index}(of_{name}, __VA_ARGS__)\n",
+                    f"#define {name}(...) shared{index}(of_{name}, __VA_ARGS__)\n",
                 ]
         return "".join(texts)
 
@@ -137,33 +137,39 @@ class _Emitter:
         """Return the code of similar functions; `tables` receives the constants that differ."""
         first, *duplicates = group
         constants = [list[str]() for _ in group]
-        places: list[int | None] = []
+        table_offsets: list[int | None] = []
         for varying in zip(*(VARYING_PART.findall(f.body) for f in group), strict=True):
             parts = [tables[name] if name else [constant] for constant, name in varying]
             differs = any(part != parts[0] for part in parts)
-            places.append(len(constants[0]) if differs else None)
+            table_offsets.append(len(constants[0]) if differs else None)
             for table, part in zip(constants, parts, strict=True):
                 table += part if differs else []
         tables |= {f.name: table for f, table in zip(group, constants, strict=True)}
         if not constants[0]:
-            same = "".join(f"#define {duplicate.name} {first.name}\n" for duplicate in duplicates)
-            return f"CODE void {first.name}({first.parameters}) {{\n{first.body}}}\n{same}"
-        place_iterator = iter(places)
+            aliases = "".join(
+                f"#define {duplicate.name} {first.name}\n" for duplicate in duplicates
+            )
+            return f"CODE void {first.name}({first.parameters}) {{\n{first.body}}}\n{aliases}"
+        offset_iterator = iter(table_offsets)
 
         def substitute(match: re.Match[str]) -> str:
-            place = next(place_iterator)
-            if place is None:
+            offset = next(offset_iterator)
+            if offset is None:
                 return match[0]
             if not match[2]:
-                return f"R(constants[{place}])"
-            return f"alike{self._functions[match[2]].group}(constants+{place}, "
+                return f"R(constants[{offset}])"
+            return f"shared{self._functions[match[2]].group}(constants+{offset}, "
 
         body = VARYING_PART.sub(substitute, first.body)
-        return f"CODE void alike{index}(const scalar *constants, {first.parameters}) {{\n{body}}}\n"
+        return (
+            f"CODE void shared{index}(const scalar *constants, {first.parameters}) {{\n{body}}}\n"
+        )
 
-    def call(self, function: ca.Function, arguments: Sequence[str], wanted: str = "wanted") -> str:
+    def call(
+        self, function: ca.Function, arguments: Sequence[str], active_lanes: str = "active_lanes"
+    ) -> str:
         """Return the C statement that calls a function."""
-        lane_mask = [wanted] if self.options.lanes > 1 else []
+        lane_mask = [active_lanes] if self.options.lanes > 1 else []
         return f"{self.name(function)}({', '.join([*arguments, *lane_mask])});"
 
     def _body(self, function: ca.Function) -> str:
@@ -205,7 +211,7 @@ class _Array(NamedTuple):
     size: int
     is_constant: bool = False
 
-    def at(self, index: int | str) -> str:
+    def item(self, index: int | str) -> str:
         """Return the C expression of an element."""
         return f"R({self.name}[{index}])" if self.is_constant else f"{self.name}[{index}]"
 
@@ -293,13 +299,13 @@ class _MXBody:
 
     @staticmethod
     def _copy(source: _Array, destination: str) -> str:
-        return f"for (int k = 0; k < {source.size}; ++k) ({destination})[k]={source.at('k')};"
+        return f"for (int k = 0; k < {source.size}; ++k) ({destination})[k]={source.item('k')};"
 
-    def _call(self, k: int, called: ca.Function) -> None:
+    def _call(self, k: int, callee: ca.Function) -> None:
         function, arguments = self._function, []
         for i, slot in enumerate(function.instruction_input(k)):
             name = f"z{k}_{i}"
-            argument = self._work.get(slot) or self._constant(name, [0.0] * called.nnz_in(i))
+            argument = self._work.get(slot) or self._constant(name, [0.0] * callee.nnz_in(i))
             if argument.is_constant and self._emitter.options.lanes > 1:
                 copy = self._array(f"y{k}_{i}", argument.size)
                 self._lines.append(self._copy(argument, copy.name))
@@ -312,9 +318,9 @@ class _MXBody:
                 arguments.append("NULL")
                 continue
             else:
-                arguments.append(self._array(f"w{k}_{i}", called.nnz_out(i)).name)
-            self._work[slot] = _Array(arguments[-1], called.nnz_out(i))
-        self._lines.append(self._emitter.call(called, arguments))
+                arguments.append(self._array(f"w{k}_{i}", callee.nnz_out(i)).name)
+            self._work[slot] = _Array(arguments[-1], callee.nnz_out(i))
+        self._lines.append(self._emitter.call(callee, arguments))
 
     def _operation(self, name: str, code: int, value: ca.MX, operands: Sequence[_Array]) -> _Array:
         size = value.nnz()
@@ -340,14 +346,14 @@ class _MXBody:
             ]
             return self._gather(name, operands[0], order)
         if code == ca.OP_HORZREPMAT:
-            array, source = self._array(name, size), operands[0].at(f"k%{operands[0].size}")
+            array, source = self._array(name, size), operands[0].item(f"k%{operands[0].size}")
             self._lines.append(f"for (int k = 0; k < {size}; ++k) {name}[k]={source};")
             return array
         if code == ca.OP_SETNONZEROS:
             array = self._array(name, size)
             self._lines.append(self._copy(operands[0], name))
             order = enumerate(_integers(value.mapping()))
-            self._lines += [f"{name}[{i}]={operands[1].at(k)};" for k, i in order]
+            self._lines += [f"{name}[{i}]={operands[1].item(k)};" for k, i in order]
             return array
         if code in (ca.OP_VERTCAT, ca.OP_HORZCAT):
             array, offset = self._array(name, size), 0
@@ -365,7 +371,7 @@ class _MXBody:
         if first is not None and list(order) == list(range(first, first + len(order))):
             return _Array(f"({source.name}+{first})", len(order), source.is_constant)
         self._lines += [f"real {name}[{max(len(order), 1)}];"] + [
-            f"{name}[{k}]={'R(0.0)' if i is None else source.at(i)};" for k, i in enumerate(order)
+            f"{name}[{k}]={'R(0.0)' if i is None else source.item(i)};" for k, i in enumerate(order)
         ]
         return _Array(name, len(order))
 
@@ -373,9 +379,9 @@ class _MXBody:
         if any(element.size not in (1, size) for element in operands):
             raise _UnsupportedOperationError
         texts = (
-            as_mask(element.at("k" if element.size > 1 else 0), False)
+            as_mask(element.item("k" if element.size > 1 else 0), False)
             if takes_mask
-            else element.at("k" if element.size > 1 else 0)
+            else element.item("k" if element.size > 1 else 0)
             for element, takes_mask in zip(operands, takes_masks(code), strict=False)
         )
         value = (MASK[code] if code in MASK else REAL[code]) % tuple(texts)
@@ -391,15 +397,18 @@ class _MXBody:
         matrices = [value.dep(i) for i in range(value.n_dep())]
         if not all(matrix.is_dense() for matrix in (value, *matrices)):
             raise _UnsupportedOperationError
-        first, x = operands[0], operands[0].at("k")
+        first, x = operands[0], operands[0].item("k")
         array, accumulator = self._array(name, value.nnz()), f"{name}[0]"
         if code == ca.OP_MTIMES:
             rows, inner, columns = value.size1(), matrices[1].size2(), value.size2()
-            left, right = operands[1].at(f"i+{rows}*k"), operands[2].at(f"k+{inner}*j")
+            a, b = (
+                operands[1].item(f"i+{rows}*k"),
+                operands[2].item(f"k+{inner}*j"),
+            )
             self._lines += [
                 self._copy(first, name),
                 f"for (int j = 0; j < {columns}; ++j) for (int k = 0; k < {inner}; ++k) "
-                f"for (int i = 0; i < {rows}; ++i) {name}[i+{rows}*j]+={left}*{right};",
+                f"for (int i = 0; i < {rows}; ++i) {name}[i+{rows}*j]+={a}*{b};",
             ]
             return array
         if code == ca.OP_FIND and self._emitter.options.lanes == 1:
@@ -407,7 +416,7 @@ class _MXBody:
             self._lines.append(f"{{ int k = 0; {zeros} {accumulator}=R(k); }}")
             return array
         update = {
-            ca.OP_DOT: f"{accumulator}+{x}*{operands[-1].at('k')}",
+            ca.OP_DOT: f"{accumulator}+{x}*{operands[-1].item('k')}",
             ca.OP_NORM2: f"{accumulator}+real_sq({x})",
             ca.OP_NORMF: f"{accumulator}+real_sq({x})",
             ca.OP_NORMINF: f"real_fmax({accumulator},real_fabs({x}))",
@@ -418,7 +427,7 @@ class _MXBody:
         }.get(code)
         if update is None:
             raise _UnsupportedOperationError
-        initial = first.at(0) if code in (ca.OP_MMIN, ca.OP_MMAX) else "R(0.0)"
+        initial = first.item(0) if code in (ca.OP_MMIN, ca.OP_MMAX) else "R(0.0)"
         self._lines.append(f"{accumulator}={initial};")
         self._lines.append(f"for (int k = 0; k < {first.size}; ++k) {accumulator}={update};")
         if code in (ca.OP_NORM2, ca.OP_NORMF):
@@ -468,17 +477,20 @@ def _switch_body(function: ca.Function, emitter: _Emitter) -> str:
             "  int branch[LANES], b;\n",
             f"  lanes_branches(i0[0], {last}, branch);\n",
             f"  for (b = 0; b <= {last}; ++b) {{\n",
-            "    const int mine = wanted & lanes_in(branch, b);\n",
+            "    const int branch_lanes = active_lanes & lanes_in(branch, b);\n",
             *(
-                f"    real *p{i} = mine == wanted || !o{i} ? o{i} : own{i};\n"
+                f"    real *p{i} = branch_lanes == active_lanes || !o{i} ? o{i} : own{i};\n"
                 for i in range(len(outputs))
             ),
-            "    if (!mine) continue;\n",
+            "    if (!branch_lanes) continue;\n",
             "    switch (b) {\n",
-            *cases(destinations, "mine"),
+            *cases(destinations, "branch_lanes"),
             "    }\n",
-            "    if (mine == wanted) return;\n",
-            *(f"    lanes_keep(mine, own{i}, {size}, o{i});\n" for i, size in enumerate(sizes)),
+            "    if (branch_lanes == active_lanes) return;\n",
+            *(
+                f"    lanes_keep(branch_lanes, own{i}, {size}, o{i});\n"
+                for i, size in enumerate(sizes)
+            ),
             "  }\n",
         )
     )

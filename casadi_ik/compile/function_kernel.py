@@ -154,7 +154,7 @@ class SingleCall:
         self._name = name
         self._run = run
         zeros = [0] * max(len(inputs), len(outputs))
-        self._job, self._kept = _map_job(inputs, zeros, outputs, zeros, 1)
+        self._job, self._buffers = _map_job(inputs, zeros, outputs, zeros, 1)
         self._reference = ctypes.byref(self._job)
 
     def __call__(self) -> None:
@@ -203,7 +203,11 @@ class FunctionKernel:
         Raises:
             KernelError: The function has no C code, or compiling failed.
         """
-        graph = function if isinstance(function, FunctionGraph) else FunctionGraph.of(function)
+        graph = (
+            function
+            if isinstance(function, FunctionGraph)
+            else FunctionGraph.from_function(function)
+        )
         self.name = graph.name
         self.input_shapes = tuple(map(_shape, graph.inputs.values()))
         self.output_shapes = tuple(map(_shape, graph.outputs))
@@ -353,7 +357,7 @@ class FunctionKernel:
         outputs: tuple[NDArray[np.float64], ...],
         count: int,
     ) -> None:
-        job, _kept = _map_job(arrays, steps, outputs, self._output_sizes, count)
+        job, _buffers = _map_job(arrays, steps, outputs, self._output_sizes, count)
         run_cancellable(self.name, self.entry, job)
 
     def _run_vm(
@@ -423,7 +427,7 @@ class Recurrence:
         return self._states[self._current]
 
     @property
-    def before(self) -> Array:
+    def previous_state(self) -> Array:
         """The state before the last step."""
         return self._states[1 - self._current]
 
@@ -475,7 +479,7 @@ class Recurrence:
         # Every sample reads its state where the previous one has written it.
         size, n_input, n_record = states.shape[1], inputs.shape[1], records.shape[1]
         arrays = (states, inputs), (size, n_input), (states[1:], records), (size, n_record)
-        job, _kept = _map_job(*arrays, count)
+        job, _buffers = _map_job(*arrays, count)
         run_cancellable(self._kernel.name, self._kernel.entry, job)
         return states[1:], records
 

@@ -17,8 +17,9 @@ from casadi_ik.compile.layout import Layout
 from casadi_ik.errors import InputError
 
 BUILD_NO_GRAPHS = ("app", "export", "files", "integrations")
-"""Rooms whose code cannot change a graph, so that it is no part of a kernel's name; import-linter
-checks that none of them uses CasADi."""
+"""Rooms whose code cannot change a graph, and is therefore not part of the name of a kernel.
+
+Import-linter checks that none of them uses CasADi."""
 
 
 DECIMALS = 12
@@ -32,7 +33,7 @@ def recipe(*parts: Any) -> str:
     The hash is the same on every machine and with every version of Python.
 
     Args:
-        parts: Everything that the graph depends on: text, numbers, arrays, records, collections.
+        parts: All data that the graph depends on: text, numbers, arrays, records, collections.
     """
     digest = hashlib.sha256(package_sources().encode())
     for part in _canonical_bytes(parts):
@@ -50,7 +51,7 @@ def _canonical_bytes(value: Any) -> Iterator[bytes]:
             array = np.round(array.astype("<f8"), DECIMALS) + 0.0  # no negative zeros
         yield f"{array.shape}{array.dtype.str}".encode() + array.tobytes()
     elif isinstance(value, Path):
-        yield value.name.encode()  # a mesh that is drawn only: its folder does not matter
+        yield value.name.encode()  # a visual mesh; its folder is irrelevant
     elif is_dataclass(value):
         yield type(value).__name__.encode()
         for item in fields(value):
@@ -73,10 +74,10 @@ def package_sources() -> str:
     digest = hashlib.sha256()
     root = Path(__file__).parents[1]
     for path in sorted(root.rglob("*.[pc]*"), key=lambda path: path.parts):
-        inside = path.relative_to(root)
-        if path.suffix not in (".py", ".c") or inside.parts[0] in BUILD_NO_GRAPHS:
+        relative_path = path.relative_to(root)
+        if path.suffix not in (".py", ".c") or relative_path.parts[0] in BUILD_NO_GRAPHS:
             continue
-        digest.update(inside.as_posix().encode() + b"\0" + path.read_bytes())
+        digest.update(relative_path.as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:32]
 
 
@@ -103,7 +104,7 @@ class FunctionGraph:
     recipe: str = ""
 
     @classmethod
-    def of(cls, function: ca.Function) -> FunctionGraph:
+    def from_function(cls, function: ca.Function) -> FunctionGraph:
         """Wrap an existing function."""
         names = function.name_in()
         return cls(
@@ -137,7 +138,7 @@ RUNNING = 0
 
 @dataclass(frozen=True)
 class StepGraph:
-    """One iteration of a method as a graph.
+    """Graph of one iteration of a method.
 
     Attributes:
         name: Identifier (letters, digits, underscores), also the kernel's file name.
@@ -154,7 +155,7 @@ class StepGraph:
             same stage share the lanes.
         recipe: Hash from `recipe`; a library with the same recipe is used without building the
             function.
-        apart: Name of the last parameter if only C reads it, so that lanes do not load it.
+        c_only: Name of the last parameter if only C code reads it, so that lanes do not load it.
         virtual: Builder of an iteration of stages without a compiler: a callable with arrays
             `inputs` and `outputs` that returns False if the step fails.
     """
@@ -167,7 +168,7 @@ class StepGraph:
     compilable: bool = True
     stage: str = ""
     recipe: str = ""
-    apart: str = ""
+    c_only: str = ""
     virtual: Callable[[], Any] | None = None
 
     def __post_init__(self) -> None:
@@ -175,14 +176,14 @@ class StepGraph:
             _ = self.function
 
     @property
-    def stage_place(self) -> int:
+    def stage_index(self) -> int:
         """Index of the stage in the state; -1 without stages."""
         return self.state.slice(self.stage).start if self.stage else -1
 
     @property
-    def seated(self) -> int:
+    def loaded_parameters(self) -> int:
         """Number of parameters that lanes load."""
-        return self.parameters.slice(self.apart).start if self.apart else self.parameters.size
+        return self.parameters.slice(self.c_only).start if self.c_only else self.parameters.size
 
     @cached_property
     def function(self) -> ca.Function | Stages:
@@ -203,5 +204,7 @@ class StepGraph:
             [self.state.size, self.record.size, 1],
         )
         if sizes != expected:
-            raise InputError(f"step graph {self.name!r}: sizes {sizes}, layouts say {expected}")
+            raise InputError(
+                f"step graph {self.name!r}: sizes {sizes}, expected {expected} from the layouts"
+            )
         return function

@@ -225,8 +225,8 @@ def opaque(rows: NDArray[Any]) -> NDArray[Any]:
 
 def split_rows(rows: NDArray[Any], counts: NDArray[np.int64]) -> tuple[NDArray[Any], ...]:
     """Return views of the rows (sum of counts,) of each solve, given the counts (k,)."""
-    ends = np.cumsum(counts)
-    pairs = zip((ends - counts).tolist(), ends.tolist(), strict=True)
+    stops = np.cumsum(counts)
+    pairs = zip((stops - counts).tolist(), stops.tolist(), strict=True)
     return tuple(rows[start:end] for start, end in pairs)
 
 

@@ -1,13 +1,13 @@
-"""Compiled libraries: loaded in this process, prebuilt, from the cache, or built now.
+"""Compiled libraries: loaded in this process, prebuilt, cached, or built on demand.
 
-A library's file name in the cache holds two hashes: of everything it was built from (the key) and
-of its own bytes. The second lets a torn file be known before it is loaded (loading one can kill the
-process), and being in the name it needs no second file that could disagree. Files appear by
-`os.replace` only: one who is killed in the middle leaves nothing that looks like a library. Of
-several processes that need the same, one builds it and the others wait.
+The file name of a library in the cache contains two hashes: of all its sources (the key), and of
+the bytes of the file. The second hash detects an incomplete file before it is loaded, which could
+crash the process; no second file is needed for it. Files are created with `os.replace` only, so
+that a process that is killed leaves no incomplete library. If several processes need the same
+library, one builds it and the others wait.
 
-The wheel `casadi-ik-kernels` (tools/build_kernels.py) brings libraries of shipped robots that were
-compiled ahead. They are told by what their text follows from, so they serve without a compiler.
+The wheel `casadi-ik-kernels` (tools/build_kernels.py) contains prebuilt libraries of shipped
+robots. They are identified by their recipe, so that they can be used without a compiler.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ _loaded: dict[str, ctypes.CDLL] = {}
 
 
 class NotCachedError(Exception):
-    """A library would have to be built, but building is not allowed."""
+    """Error for a library that is not cached and may not be built."""
 
 
 def load_function(
@@ -87,7 +87,7 @@ def load_function(
     """Load the compiled library of a function and its runtime; see `load_library`.
 
     Args:
-        name: Name of the library's file.
+        name: Name of the library file.
         build: Builder of the function.
         driver: C text of the runtime with its constants.
         symbol: Name of the exported C function.
@@ -109,7 +109,7 @@ def load_library(
     """Load a compiled library from this process, prebuilt, from disk, or build it.
 
     Args:
-        name: Name of the library's file.
+        name: Name of the library file.
         text: Builder of its C text.
         symbol: Name of an exported C function.
         recipe: Recipe of the text, "" if it is unknown. A library with this recipe is used without
@@ -124,27 +124,27 @@ def load_library(
     """
     if is_virtual():
         return None
-    # The hash distinguishes names that are equal up to here.
+    # The hash distinguishes names with the same first 100 characters.
     short = name[:100]
-    ahead = f"{short}-{_hash(recipe)}" if recipe else ""
+    prebuilt_name = f"{short}-{_hash(recipe)}" if recipe else ""
     with _lock:
-        if ahead and (library := _load_prebuilt(ahead, symbol)) is not None:
+        if prebuilt_name and (library := _load_prebuilt(prebuilt_name, symbol)) is not None:
             return library
         compiler = find_compiler()
         if compiler is None:
             warn_no_compiler()
             return None
-        note = f"{short}-{_key(compiler, *_graph_versions(), recipe)}.key"
+        key_file = f"{short}-{_key(compiler, *_graph_versions(), recipe)}.key"
         folders = search_path()
         for directory in folders if recipe else ():
-            if (library := _load_by_recipe(directory, short, note, symbol)) is not None:
+            if (library := _load_by_recipe(directory, short, key_file, symbol)) is not None:
                 return library
         if is_cached_only():
             raise NotCachedError(name)
         with interrupt_afterwards():
             source = text()
         for listener in text_listeners:
-            listener(ahead, source)
+            listener(prebuilt_name, source)
         key = _key(compiler, source)
         library = _loaded.get(key) or _load_or_build(
             folders, f"{short}-{key}", source, compiler, symbol
@@ -153,7 +153,7 @@ def load_library(
             return None
         _loaded[key] = library
         for directory in folders if recipe else ():
-            _remember_key(directory / note, key)
+            _remember_key(directory / key_file, key)
         return library
 
 
@@ -180,10 +180,10 @@ def _hash(*parts: str) -> str:
 @cache
 def prebuilt_folder() -> Path | None:
     """Return the folder of libraries prebuilt from these sources; None if there are none."""
-    found = importlib.util.find_spec(PREBUILT_PACKAGE)
-    if found is None or not found.submodule_search_locations:
+    spec = importlib.util.find_spec(PREBUILT_PACKAGE)
+    if spec is None or not spec.submodule_search_locations:
         return None
-    folder = Path(found.submodule_search_locations[0])
+    folder = Path(spec.submodule_search_locations[0])
     try:
         made_for = (folder / "made_for").read_text(encoding="ascii").strip()
     except OSError:
@@ -191,7 +191,7 @@ def prebuilt_folder() -> Path | None:
     if made_for == package_sources():
         return folder
     warnings.warn(
-        f"casadi-ik-kernels was made for another version than casadi-ik {version('casadi-ik')}: "
+        f"casadi-ik-kernels was built for another version than casadi-ik {version('casadi-ik')}: "
         "its kernels are not used",
         RuntimeWarning,
         stacklevel=2,
@@ -217,9 +217,9 @@ def _load_prebuilt(name: str, symbol: str) -> ctypes.CDLL | None:
     return library
 
 
-def _load_by_recipe(directory: Path, name: str, note: str, symbol: str) -> ctypes.CDLL | None:
-    """Load the library that a recipe led to before; None if there is none."""
-    path = directory / note
+def _load_by_recipe(directory: Path, name: str, key_file: str, symbol: str) -> ctypes.CDLL | None:
+    """Load the library whose key is stored for a recipe; None if there is none."""
+    path = directory / key_file
     try:
         key = path.read_text(encoding="ascii") if is_private_file(path) else ""
     except (OSError, ValueError):
@@ -233,7 +233,7 @@ def _load_by_recipe(directory: Path, name: str, note: str, symbol: str) -> ctype
 
 
 def _remember_key(path: Path, key: str) -> None:
-    """Store the key that a recipe led to; a failure only costs time later."""
+    """Store the key of a recipe; a failure is ignored, because the library can be built again."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         part.write_text(key, encoding="ascii")
@@ -272,28 +272,28 @@ def _load_or_build(
     problems: dict[Path, OSError | UnloadableError] = {}
     library = None
 
-    def found() -> ctypes.CDLL | None:
+    def load_from_disk() -> ctypes.CDLL | None:
         return next(filter(None, (_load_from(folder, stem, symbol) for folder in folders)), None)
 
-    if (library := found()) is not None:
+    if (library := load_from_disk()) is not None:
         return library
     announce(stem.rpartition("-")[0], len(source))
-    for place in chain(folders, temporary_folder(folders)):
+    for folder in chain(folders, temporary_folder(folders)):
         try:
-            remove_stale(place, "build-*", 1)
-            remove_stale(place, ".*.part", -2)
-            remove_stale(place, ".*.lock")
-            with _exclusive_build(place / f".{stem}.lock"):
-                library = found() or _compile(place, stem, source, compiler, symbol)
+            remove_stale(folder, "build-*", 1)
+            remove_stale(folder, ".*.part", -2)
+            remove_stale(folder, ".*.lock")
+            with _exclusive_build(folder / f".{stem}.lock"):
+                library = load_from_disk() or _compile(folder, stem, source, compiler, symbol)
             break
         except (OSError, UnloadableError) as error:
-            problems[place] = error
-    for place, error in problems.items():
+            problems[folder] = error
+    for folder, error in problems.items():
         if library is None and isinstance(error, UnloadableError):
             raise error
-        warn_once(str(place), f"cannot be used: {os_reason(error)}")
+        warn_once(str(folder), f"cannot be used: {os_reason(error)}")
     if library is None:
-        warn_no_compiler("there is no room for what it makes")
+        warn_no_compiler("the libraries cannot be stored")
     return library
 
 
@@ -301,8 +301,8 @@ def _load_or_build(
 def _exclusive_build(path: Path) -> Iterator[None]:
     """Wait while another process builds the same library.
 
-    Windows and some file systems have no such locks; there two processes may build the same
-    library, which is harmless. A process that is killed releases its lock.
+    Windows and some file systems have no such locks; two processes may then build the same library,
+    which is harmless. A process that is killed releases its lock.
     """
     try:
         import fcntl
@@ -336,18 +336,18 @@ def _compile(
         OSError: The directory is not writable or full.
         KernelError: Compiling failed, or the result is not a library.
     """
-    with temporary_build_dir(directory) as place:
-        text, file = place / "kernel.c", place / "kernel.so"
+    with temporary_build_dir(directory) as folder:
+        text, file = folder / "kernel.c", folder / "kernel.so"
         text.write_text(source, encoding="utf-8")
         compiler.build(text, file)
-        # Load it before other processes see it, since they might remove it.
+        # Load the library before other processes see it, because they might remove it.
         try:
             library = ctypes.CDLL(str(file))
             library[symbol]
         except (OSError, AttributeError) as error:
             raise UnloadableError(
-                f"compiler {compiler} ended well, but what it made cannot be loaded "
-                f"(CC=... names another compiler, CC=none does without): {error}"
+                f"compiler {compiler} succeeded, but the library cannot be loaded "
+                f"(set CC to another compiler, or CC=none to use none): {error}"
             ) from error
         file.chmod(0o700)
         file.replace(directory / f"{stem}-{_content_hash(file)}.so")

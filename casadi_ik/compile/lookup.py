@@ -59,7 +59,7 @@ class LookupKernel:
         Raises:
             KernelError: The function has no C code, or compiling failed.
         """
-        graph = key if isinstance(key, FunctionGraph) else FunctionGraph.of(key)
+        graph = key if isinstance(key, FunctionGraph) else FunctionGraph.from_function(key)
         self.constants = {
             "N_KEY": graph.outputs[0][0],
             "TILE": TILE,
@@ -78,8 +78,8 @@ class LookupKernel:
         self.entry: Any = self.key.library[LOOKUP_SYMBOL] if self.compiled else None
 
     def _driver(self) -> str:
-        own = define(self.constants | {"REGISTER_BYTES": 8 * machine_lanes()})
-        return own + driver_text("lookup_job") + driver_text("lookup")
+        constants = define(self.constants | {"REGISTER_BYTES": 8 * machine_lanes()})
+        return constants + driver_text("lookup_job") + driver_text("lookup")
 
     def __call__(self, count: int, *inputs: Any) -> NDArray[np.int64]:
         """Find the nearest rows.
@@ -105,7 +105,7 @@ class LookupKernel:
     def _run_compiled(
         self, arrays: list[NDArray[np.float64]], steps: list[int], rows: NDArray[np.int64]
     ) -> None:
-        job, _kept = self._job(arrays, rows, steps)
+        job, _buffers = self._job(arrays, rows, steps)
         run_cancellable(self.key.name, self.entry, job)
 
     def _job(
@@ -121,9 +121,9 @@ class LookupKernel:
             inputs=ctypes.addressof(sources),
             input_steps=ctypes.addressof(strides),
             tiles=memory(self.tiles),
-            found=memory(rows),
+            nearest_rows=memory(rows),
             rows=len(self._keys),
-            wanted=rows.shape[1],
+            n_nearest=rows.shape[1],
             count=len(rows),
             slice=SLICE,
         )
@@ -135,10 +135,10 @@ class LookupKernel:
         for start in range(0, len(keys), CHUNK):
             stop_if_cancelled()
             part = keys[start : start + CHUNK]
-            known = ~np.isnan(part)
-            targets = 2 * _rounded(np.where(known, part, 0.0))
+            is_known = ~np.isnan(part)
+            targets = 2 * _rounded(np.where(is_known, part, 0.0))
             # |row - key|^2 over known entries, without the term that all rows share.
-            distance = known.astype(np.float32) @ self._keys.T**2 - targets @ self._keys.T
+            distance = is_known.astype(np.float32) @ self._keys.T**2 - targets @ self._keys.T
             order = distance.argsort(axis=1, kind="stable")
             rows[start : start + CHUNK] = order[:, : rows.shape[1]]
 

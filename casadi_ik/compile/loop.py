@@ -155,9 +155,9 @@ class _Records:
 LOOP_SYMBOL = "casadi_ik_loop"
 
 SLOTS = 32
-"""Number of slots: solves in progress, of which four or eight occupy the lanes."""
+"""Number of slots, which hold the solves in progress; four or eight of them are in the lanes."""
 
-MIN_SIDE_BY_SIDE = 4
+MIN_SOLVES_IN_LANES = 4
 """Minimum number of solves for which lanes are used."""
 
 NO_LIMIT = 2**62
@@ -166,13 +166,13 @@ NO_LIMIT = 2**62
 MIN_BATCH_FOR_LANES = 64
 """Minimum batch size for which the loop with lanes is compiled if it is not in the cache.
 
-Without lanes a solve takes one to two milliseconds; compiling takes most of a minute."""
+Without lanes a solve takes one to two milliseconds; the compilation takes about a minute."""
 
 CACHE_RECHECK_SOLVES = 1000
 """Number of solves in small batches after which the cache is searched again."""
 
 TRACE_GROWTH = 1.25
-"""Initial capacity of a trace relative to what the previous trace needed."""
+"""Initial capacity of a trace relative to the size of the previous trace."""
 
 MAX_FIRST_TRACE_BYTES = 2**24
 """Maximum initial capacity of a trace [bytes]."""
@@ -206,7 +206,7 @@ class SlotSource:
 
 
 class CompiledBatch:
-    """A batch that a compiled loop works on."""
+    """Batch of solves, with the memory of a compiled loop."""
 
     def __init__(
         self, step: StepGraph, result: LoopResult, starts: SlotSource, budget: int
@@ -215,7 +215,7 @@ class CompiledBatch:
 
         Args:
             step: The step.
-            result: Result with the first states; it receives everything else.
+            result: Result with the first states; the loop writes its other fields.
             starts: Memory from which the slots load solves.
             budget: Maximum number of iterations of each start.
         """
@@ -224,7 +224,7 @@ class CompiledBatch:
         slots = starts.slots
         self._row_owners = np.empty((0, 2), dtype=np.int64)
         self._slots = np.full(slots, -1, dtype=np.int64)
-        self._begun = np.zeros(slots, dtype=np.int64)
+        self._iterations_before = np.zeros(slots, dtype=np.int64)
         self._mark = np.zeros((slots, step.state.size))
         self.job = Job(
             states=starts.states,
@@ -235,24 +235,24 @@ class CompiledBatch:
             status=memory(result.status),
             seconds=memory(result.time),
             slots=memory(self._slots),
-            begun=memory(self._begun),
+            iterations_before=memory(self._iterations_before),
             mark=memory(self._mark),
             slot_count=slots,
             count=len(result.status),
             max_iterations=budget,
-            left=NO_LIMIT,
-            fewest=MIN_SIDE_BY_SIDE,
+            remaining_steps=NO_LIMIT,
+            min_solves=MIN_SOLVES_IN_LANES,
             slice=SLICE,
             follow=starts.follow,
             method=starts.method,
         )
 
-    def run(self, side_by_side: Any, one_by_one: Any) -> LoopResult:
+    def run(self, lane_loop: Any, scalar_loop: Any) -> LoopResult:
         """Solve the batch.
 
         Args:
-            side_by_side: The loop with lanes; None if there is none.
-            one_by_one: The loop without lanes, which also makes the last few solves.
+            lane_loop: The loop with lanes; None if there is none.
+            scalar_loop: The loop without lanes, which also computes the last few solves.
 
         Returns:
             The result, with rows in the order of the solves.
@@ -260,7 +260,7 @@ class CompiledBatch:
         Raises:
             MemoryError: There is no work memory.
         """
-        loop = side_by_side or one_by_one
+        loop = lane_loop or scalar_loop
         if self.result.rows is not None:
             self._resize_rows(len(self.result.rows))
         while (code := loop(ctypes.byref(self.job))) != DriverCode.DONE:
@@ -268,8 +268,8 @@ class CompiledBatch:
             if code == DriverCode.ROWS_FULL:
                 self._resize_rows(2 * self.job.capacity)
             if code == DriverCode.FEW_LEFT:
-                loop = one_by_one
-        self._resize_rows(self.job.used)
+                loop = scalar_loop
+        self._resize_rows(self.job.n_rows)
         if self.result.rows is None or self.job.count == 1:
             return self.result
         return replace(self.result, rows=self._rows_by_solve(self.result.rows))
@@ -280,7 +280,7 @@ class CompiledBatch:
         if rows is not None:
             rows.resize(count, refcheck=False)
             self._row_owners.resize((count, 2), refcheck=False)
-            self.job.rows, self.job.places = memory(rows), memory(self._row_owners)
+            self.job.rows, self.job.row_owners = memory(rows), memory(self._row_owners)
             self.job.capacity = count
 
     def _rows_by_solve(self, rows: NDArray[Any]) -> NDArray[Any]:
@@ -332,29 +332,29 @@ class LoopKernel:
     @property
     def lanes(self) -> int:
         """Number of lanes in which a batch is solved; 1 without lanes."""
-        return 1 if self._side_by_side is None else machine_lanes()
+        return 1 if self._lane_loop is None else machine_lanes()
 
     def _loop_for(self, count: int) -> Any:
         """Return the loop with lanes if it pays for a batch of this size, otherwise None."""
-        if count < MIN_SIDE_BY_SIDE:
+        if count < MIN_SOLVES_IN_LANES:
             return None
-        if count >= MIN_BATCH_FOR_LANES or "_side_by_side" in vars(self):
-            return self._side_by_side
+        if count >= MIN_BATCH_FOR_LANES or "_lane_loop" in vars(self):
+            return self._lane_loop
         self._solves_until_recheck -= count
-        return None if self._solves_until_recheck > 0 else self._cached_side_by_side
+        return None if self._solves_until_recheck > 0 else self._cached_lane_loop
 
     @property
-    def _cached_side_by_side(self) -> Any:
+    def _cached_lane_loop(self) -> Any:
         """The loop with lanes if it is in the cache, otherwise None."""
         try:
             with cached_only():
-                return self._side_by_side
+                return self._lane_loop
         except NotCachedError:
             self._solves_until_recheck = CACHE_RECHECK_SOLVES  # a search of the cache takes 1 ms
             return None
 
     @cached_property
-    def _side_by_side(self) -> Any:
+    def _lane_loop(self) -> Any:
         """The loop with lanes; None if there is none."""
         lanes = machine_lanes() if self.compiled else 0
         if not lanes:
@@ -372,14 +372,14 @@ class LoopKernel:
         return {
             "N_STATE": self.step.state.size,
             "N_PARAMETERS": self.step.parameters.size,
-            "N_SEATED": self.step.seated,
+            "N_LOADED": self.step.loaded_parameters,
             "RUNNING": RUNNING,
             "NON_FINITE": NON_FINITE,
             "REPEATED": REPEATED,
             "CODE_LIMIT": CODE_LIMIT,
             "SLOTS": SLOTS,
             "FIRST_MARK": FIRST_MARK,
-            "STAGE": self.step.stage_place,
+            "STAGE": self.step.stage_index,
         }
 
     def _driver(self) -> str:
@@ -497,12 +497,12 @@ class LoopKernel:
 Vector = NDArray[np.float64]
 
 NextRestart = Callable[[int, Vector], tuple[Vector, Vector] | None]
-"""Maps the status and the last state of a restart to the state (ns,) and parameters (np,) of the
-next one; None if the solve is over."""
+"""Function from the status and last state of a restart to the state (ns,) and parameters (np,) of
+the next restart; None if the solve is finished."""
 
 
 class Stepper:
-    """Runs a loop one iteration at a time.
+    """Execution of a loop in single iterations.
 
     Iterating over a stepper makes steps until the solve ends; the caller limits their number.
 

@@ -74,7 +74,7 @@ ELEMENTARY_KINDS = {
     ca.OP_COS: SIN_COS,
     **dict.fromkeys((ca.OP_ASIN, ca.OP_ACOS, ca.OP_ATAN, ca.OP_ATAN2), ARCS),
 }
-"""Elementary functions of which one call computes several (runtime/elementary_calls.c)."""
+"""Elementary functions that one call computes for several values (elementary_calls.c)."""
 
 VECTOR_SIZES = (1, 2, 4)
 """Numbers of values that one call of an elementary function can compute."""
@@ -420,7 +420,7 @@ class _Writer:
         node.is_written = True
 
     def _append_call(self, number: int) -> None:
-        """Append a call of an elementary function and of later ones that are ready as well."""
+        """Append a call of an elementary function, with later ones whose inputs are ready."""
         group, lanes = self._group(number)
         for node in group:
             for need in node.needs:

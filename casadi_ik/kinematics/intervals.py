@@ -102,7 +102,7 @@ class _Evaluation:
             [Bounds(ca.SX(0), ca.SX(0), 0.0)] * function.numel_out(i)
             for i in range(function.n_out())
         ]
-        places = [function.sparsity_out(i).find() for i in range(function.n_out())]
+        targets = [function.sparsity_out(i).find() for i in range(function.n_out())]
         sources = [function.sparsity_in(i).find() for i in range(function.n_in())]
         work: dict[int, Bounds] = {}
         elements: Any = None
@@ -117,7 +117,7 @@ class _Evaluation:
                 work[slots[0]] = inputs[index][sources[index][element]]
             elif code == ca.OP_OUTPUT:
                 index, element = slots
-                outputs[index][places[index][element]] = work[arguments[0]]
+                outputs[index][targets[index][element]] = work[arguments[0]]
             elif code == ca.OP_CALL:
                 elements = function.instructions_sx() if elements is None else elements
                 values = [work[i] for i in arguments]
@@ -134,15 +134,15 @@ class _Evaluation:
         inputs, first = [], 0
         for i in range(function.n_in()):
             elements = [_constant(0.0)] * function.numel_in(i)
-            for place in function.sparsity_in(i).find():
-                elements[place] = values[first]
+            for element in function.sparsity_in(i).find():
+                elements[element] = values[first]
                 first += 1
             inputs.append(elements)
         outputs = self.run(function, inputs)
         return [
-            outputs[i][place]
+            outputs[i][element]
             for i in range(function.n_out())
-            for place in function.sparsity_out(i).find()
+            for element in function.sparsity_out(i).find()
         ]
 
     def _apply(self, code: int, values: list[Bounds]) -> Bounds:
@@ -154,7 +154,7 @@ class _Evaluation:
             return _product(dividend, self._inverse(divisor))
         operation = OPERATIONS.get(code)
         if operation is None or any(value is UNKNOWN for value in values):
-            # An operation without an interval form, in a call of which other results are used.
+            # The operation has no interval form, but other results of the call are used.
             return UNKNOWN
         return operation(a, b)
 

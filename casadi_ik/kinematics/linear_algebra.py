@@ -39,7 +39,7 @@ def solve_spd(A: Expr, b: Expr) -> Expr:
     """Solve A x = b for a symmetric positive definite A by LDL' without pivoting.
 
     Args:
-        A: (n, n) matrix, of which only the lower triangle is read.
+        A: (n, n) matrix; only the lower triangle is read.
         b: (n, k) right-hand sides.
 
     Returns:

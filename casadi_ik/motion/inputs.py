@@ -258,7 +258,7 @@ class FollowerInputs:
         q = np.clip(previous[:n] + step, *self._bounds)
         state = self.step_from_rest(q)
         state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n] = q, step, q, 0.0
-        self.run.before[:] = previous
+        self.run.previous_state[:] = previous
         return state
 
     def set_posture(self, posture: Array) -> None:

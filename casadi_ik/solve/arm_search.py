@@ -290,9 +290,9 @@ class ArmSearch:
                 owner=None if owner is None else owner[rows].ctypes.data,
                 min_limit_margin=ARM_SEARCH.tolerance,
                 count=rows.stop - rows.start,
-                chosen=memory(best_arms[rows]),
+                best_arms=memory(best_arms[rows]),
                 score=memory(score[rows]),
-                tried=memory(arms_tried[rows]),
+                arms_tried=memory(arms_tried[rows]),
             )
             query, buffers = problem.query, None
             if query is not None and len(query.table.pairs):

@@ -159,7 +159,7 @@ def test_wrong_inputs_are_named():
 def graph() -> FunctionGraph:
     x = ca.SX.sym("x", 3)
     values = ca.vertcat(ca.sin(x[0]), ca.cos(x[0]), x[1] * x[2])
-    return FunctionGraph.of(ca.Function("measured", [x], [values]))
+    return FunctionGraph.from_function(ca.Function("measured", [x], [values]))
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -244,7 +244,7 @@ def test_names_of_functions(directory, name):
     ("property_name", "expected_words"),
     [
         (': > "$out"', "cannot be loaded"),
-        ('rm "$out"', "made no library"),
+        ('rm "$out"', "produced no library"),
         ("kill -9 $$", "failed with SIGKILL"),
         ('echo "int x;" > "$out.c"; cc -shared -o "$out" "$out.c"', "undefined symbol"),
         ("seq 100000 >&2; exit 3", "failed with exit code 3"),

@@ -28,7 +28,7 @@ from casadi_ik.compile.loop import (
     FIRST_ROWS,
     MAX_FIRST_TRACE_BYTES,
     MIN_BATCH_FOR_LANES,
-    MIN_SIDE_BY_SIDE,
+    MIN_SOLVES_IN_LANES,
     SLOTS,
 )
 
@@ -309,7 +309,7 @@ def test_keyboard_interrupt_reaches_a_compiled_loop():
 
 pytestmark = needs_compiler
 
-COUNTS = (MIN_SIDE_BY_SIDE, 9, 2 * SLOTS + 3)
+COUNTS = (MIN_SOLVES_IN_LANES, 9, 2 * SLOTS + 3)
 """Solves in a batch: fewer than lanes, one that must wait, many more than are under way at once."""
 
 
@@ -435,7 +435,14 @@ def test_traces_longer_than_the_previous():
     """Room is made for as much as the last one needed: too much, too little, none at all."""
     kernel = LoopKernel(counting_step("lengths"))
     assert kernel.lanes > 1
-    for count, ends in ((40, 3), (40, 700), (9, 2), (MIN_SIDE_BY_SIDE - 1, 900), (2, 0), (70, 5)):
+    for count, ends in (
+        (40, 3),
+        (40, 700),
+        (9, 2),
+        (MIN_SOLVES_IN_LANES - 1, 900),
+        (2, 0),
+        (70, 5),
+    ):
         ran = kernel.run(np.zeros((count, 1)), np.full((count, 1), ends), ends, trace=True)
         assert ran.rows is not None
         assert ran.rows.base is None
@@ -462,8 +469,8 @@ def test_small_batches_do_not_wait_for_a_compiler(monkeypatch, tmp_path, lanes):
     assert run(early, MIN_BATCH_FOR_LANES)[: len(few)] == few
     assert compiled() == 1
     later = LoopKernel(step)
-    assert later._loop_for(MIN_SIDE_BY_SIDE - 1) is None
-    assert later._loop_for(MIN_SIDE_BY_SIDE) is not None
+    assert later._loop_for(MIN_SOLVES_IN_LANES - 1) is None
+    assert later._loop_for(MIN_SOLVES_IN_LANES) is not None
     assert run(later, MIN_BATCH_FOR_LANES - 1) == few
 
 

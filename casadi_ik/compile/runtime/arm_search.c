@@ -1,12 +1,12 @@
 /* Search for the preferred collision-free arms at given palm poses.
  *
  * All arms in closed form, at given samples of the redundancy (swivel angle, swept joint), are
- * sorted by the preference and checked, as many at a time as there are lanes, until one is
+ * sorted by the preference and checked in the lanes until an arm is
  * collision-free. The redundancy is then refined around that sample, on the same branch. If no arm
  * is collision-free, a second level of samples is tried before the hand is given up.
  *
  * The compiled kernels are called through pointers. A freestanding solver (FREESTANDING) defines
- * how, and where the memory is: KERNEL, CALL, ROOM, GIVE_BACK, OWN_MEMORY.
+ * calls and memory: KERNEL, CALL, ROOM, GIVE_BACK, OWN_MEMORY.
  */
 #include <math.h>
 #include <stdint.h>
@@ -42,23 +42,23 @@ typedef struct {
   int64_t n_q, n_arm, n_redundancy, n_rows;
   int64_t n_groups;            /* 1: a single arm; else one of every branch, and the given arm */
   int64_t n_samples[LEVELS], n_offsets;
-  const scalar *samples[LEVELS]; /* rows of n_redundancy, of which a refinement varies the last */
+  const scalar *samples[LEVELS]; /* rows of n_redundancy; a refinement varies the last column */
   const scalar *offsets;       /* of the refinement around the chosen sample */
   const int64_t *columns;      /* of the arm in q */
   const scalar *lower, *upper; /* bounds of the arm */
   const scalar *low, *range;   /* limits of the arm, which define its limit margin */
   const scalar *q, *palms, *starts; /* rows of n_q, 16 and n_q */
-  const int64_t *owner;        /* of each hand, with equal owners next to each other: hands after
-                                  the first one with an arm are skipped; NULL: none is */
+  const int64_t *owner;        /* of each hand, in contiguous groups: after the first hand with an
+                                  arm the other hands of its owner are skipped; NULL: no skipping */
   const scalar *clearance_bounds; /* of each hand: upper bound of the clearance of its arms */
   const scalar *poses;
-  int64_t pose_step;           /* numbers from one hand to the next, 0: the same for all */
+  int64_t pose_step;           /* distance between consecutive hands; 0: shared by all hands */
   scalar margin, rounding;     /* required clearance, and the allowed rounding error below it */
   scalar min_limit_margin;     /* distance of a joint from its bounds; negative: rounding error */
   int64_t count;
-  scalar *chosen;              /* rows of n_groups arms */
+  scalar *best_arms;            /* rows of n_groups arms */
   scalar *score;               /* rows of n_groups: score of the arm alone; -inf: no arm */
-  int64_t *tried;              /* number of arms within bounds */
+  int64_t *arms_tried;             /* number of arms within bounds */
   OWN_MEMORY
 } arm_search_job;
 
@@ -243,14 +243,14 @@ static int measure_arms(const arm_search_job *job, scratch *space, int64_t hand,
                  candidates->count);
 }
 
-/* Find the best collision-free arm of a group with a score above `best_score`; `chosen` is its
+/* Find the best collision-free arm of a group with a score above `best_score`; `best` is its
  * index or -1. */
 static int best_free_arm(const arm_search_job *job, scratch *space, int64_t hand, pool *from,
-                      int64_t group, scalar *best_score, int64_t *chosen) {
+                      int64_t group, scalar *best_score, int64_t *best) {
   const int clearest = job->order == CLEAREST;
   clearance_job *clearance = job->clearance;
   const int64_t max_picked = clearance ? job->lanes : 1;
-  *chosen = -1;
+  *best = -1;
   for (;;) {
     const scalar min_score = clearest ? -INFINITY : *best_score;
     int64_t count = 0, i, n, *picked = space->picked;
@@ -272,8 +272,8 @@ static int best_free_arm(const arm_search_job *job, scratch *space, int64_t hand
       set_configuration(job, hand, from->arms + from->arm[picked[n]], space->rows + n * job->n_q);
     }
     if (!clearance) {
-      *chosen = space->picked[0];
-      *best_score = from->score[*chosen];
+      *best = space->picked[0];
+      *best_score = from->score[*best];
       return DONE;
     }
     clearance->q = space->rows;
@@ -296,7 +296,7 @@ static int best_free_arm(const arm_search_job *job, scratch *space, int64_t hand
       }
       i = space->picked[n];
       if (clearest ? surplus > *best_score : surplus >= -job->rounding) {
-        *chosen = i;
+        *best = i;
         *best_score = clearest ? surplus : from->score[i];
         if (!clearest) return DONE;
       }
@@ -346,12 +346,12 @@ static int search_level(const arm_search_job *job, scratch *space, int64_t hand,
     for (i = 0; i < job->n_arm; ++i) given_arm[i] = job->q[hand * job->n_q + job->columns[i]];
     add_arm(job, hand, all, count * size, -1, job->n_groups - 1);
   }
-  job->tried[hand] += all->count;
+  job->arms_tried[hand] += all->count;
   code = measure_arms(job, space, hand, all);
   if (code != DONE) return code;
   for (group = 0; group < job->n_groups; ++group) {
     scalar *score = job->score + hand * job->n_groups + group;
-    scalar *arm = job->chosen + (hand * job->n_groups + group) * job->n_arm;
+    scalar *arm = job->best_arms + (hand * job->n_groups + group) * job->n_arm;
     code = best_free_arm(job, space, hand, all, group, score, &chosen);
     if (code != DONE) return code;
     if (chosen < 0) continue;
@@ -375,7 +375,7 @@ EXPORT int casadi_ik_arm_search(arm_search_job *job) {
   lay_out(job, &space, block);
   for (hand = 0; hand < job->count && code == DONE; ++hand) {
     int level, success = 0;
-    job->tried[hand] = 0;
+    job->arms_tried[hand] = 0;
     for (i = 0; i < job->n_groups; ++i) job->score[hand * job->n_groups + i] = -INFINITY;
     if (job->owner && hand && job->owner[hand] == job->owner[hand - 1] && owner_is_done) continue;
     for (level = 0; level < LEVELS && !success && code == DONE; ++level) {

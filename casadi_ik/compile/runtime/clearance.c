@@ -274,7 +274,7 @@ static void mark_critical(clearance_job *job, int64_t pair) {
 
 /* Compute the distance of a pair; returns 0 without a distance if it is at least `enough` in all
  * lanes. */
-LANES_INLINE int apart(const clearance_job *job, int64_t pair, const lanes *placed, lanes enough,
+LANES_INLINE int pair_distance(const clearance_job *job, int64_t pair, const lanes *placed, lanes enough,
                        lanes *lines, lanes *distance) {
   const int i = job->pairs[2 * pair], j = job->pairs[2 * pair + 1];
   const vector c = load(placed + 6 * i), h = load(placed + 6 * i + 3);
@@ -301,15 +301,15 @@ typedef struct {
   lanes *lines;                /* values and slopes of a convex solid's planes */
 } placing;
 
-/* Number of values in this memory. */
-static size_t room(const clearance_job *job) {
-  int64_t most = 0, k;
+/* Return the number of values in this memory. */
+static size_t work_size(const clearance_job *job) {
+  int64_t max_planes = 0, k;
   for (k = 0; k < N_OWN + job->n_solids; ++k) {
-    if (job->solids[k].kind == CONVEX && job->solids[k].planes > most) {
-      most = job->solids[k].planes;
+    if (job->solids[k].kind == CONVEX && job->solids[k].planes > max_planes) {
+      max_planes = job->solids[k].planes;
     }
   }
-  return (size_t) (N_Q + 6 * N_CAPSULES + 12 * (N_OWN + job->n_solids) + 2 * most);
+  return (size_t) (N_Q + 6 * N_CAPSULES + 12 * (N_OWN + job->n_solids) + 2 * max_planes);
 }
 
 static LANES_TARGET void lay_out(placing *buffers, const clearance_job *job) {
@@ -324,7 +324,7 @@ LANES_TARGET DRIVER(clearance, clearance_job) {
   placing buffers;
   int64_t ticks = 0, k;
   scalar *poses, deadline;
-  int lane, outcome = set_up(&buffers.space, room(job));
+  int lane, outcome = set_up(&buffers.space, work_size(job));
   if (outcome != DONE) return outcome;
   lay_out(&buffers, job);
   poses = (scalar *) (buffers.placed + 6 * N_CAPSULES + 12 * N_OWN);
@@ -352,7 +352,7 @@ LANES_TARGET DRIVER(clearance, clearance_job) {
       const lanes cutoff = job->all_distances ? SPREAD(INFINITY) : minimum;
       lanes distance;
       lane_mask nearer;
-      if (pair < 0 || !apart(job, pair, buffers.placed, cutoff, buffers.lines, &distance)) continue;
+      if (pair < 0 || !pair_distance(job, pair, buffers.placed, cutoff, buffers.lines, &distance)) continue;
       if (job->all_distances) {
         for (lane = 0; lane < LANES && job->next + lane < job->count; ++lane) {
           job->all_distances[(job->next + lane) * job->n_pairs + pair] = lanes_at(distance, lane);

@@ -1,7 +1,7 @@
-/* Shared by the drivers; stands behind the code of one function.
+/* Definitions shared by the drivers, placed after the code of one function.
  *
- * Expects the macros STEP(arg, res, wanted), which calls that function, and STEP_IN and STEP_OUT,
- * how many inputs and outputs it has. C99 with POSIX clocks.
+ * Requires the macros STEP(arg, res, active_lanes), which calls that function, and STEP_IN and
+ * STEP_OUT, its numbers of inputs and outputs. C99 with POSIX clocks.
  */
 #include <stdint.h>
 #include <stdlib.h>
@@ -14,13 +14,13 @@
 #define EXPORT __attribute__((visibility("default")))
 #endif
 
-/* The function of a driver, which Python calls. */
+/* Entry point of a driver, which Python calls. */
 #define DRIVER(name, work) EXPORT int casadi_ik_##name(work *job)
 
-/* What it returns. */
-enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, GOES_ON = 3, FEW_LEFT = 4, NO_MEMORY = -1 };
+/* Result of a driver. */
+enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, CONTINUES = 3, FEW_LEFT = 4, NO_MEMORY = -1 };
 
-/* The clock is looked at once in so many evaluations: reading it costs about 25 ns. */
+/* Number of evaluations between readings of the clock, which take about 25 ns. */
 #define CLOCK_INTERVAL 16
 
 static double monotonic(void) {
@@ -29,7 +29,7 @@ static double monotonic(void) {
   return (double) now.tv_sec + 1e-9 * (double) now.tv_nsec;
 }
 
-/* Everything one call of a driver works on; each call has its own, so threads never share any. */
+/* Memory of one call of a driver; threads share no workspace. */
 typedef struct {
   void *block;
   const real *arg[STEP_IN + 1];
@@ -37,7 +37,7 @@ typedef struct {
   real *extra;
 } workspace;
 
-/* Memory for numbers, aligned for vectors: malloc's alignment is less than they need. */
+/* Allocate `extra` numbers, aligned for vectors, for which the alignment of malloc is too small. */
 static int set_up(workspace *space, size_t extra) {
   char *block = malloc((extra + 2) * sizeof(real));
   space->block = block;

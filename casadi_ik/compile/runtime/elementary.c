@@ -1,26 +1,26 @@
-/* Sines, cosines and arc functions, as plain functions and once more for vectors.
+/* Sines, cosines and arc functions for scalars and vectors.
  *
- * The C library takes one number at a time: of four or eight solves side by side a quarter of the
- * time went there. These are arithmetic only, and the same arithmetic in both forms: a solve's
- * iterates are bit for bit the same alone and among others, and do not depend on whose C library a
- * machine has. Within 2 units in the last place of normal numbers; angles beyond 5e8 rad go to the C library.
- * Reductions and coefficients are those of Moshier's Cephes library (sin.c, atan.c).
+ * The C library computes one number per call, which took a quarter of the time of four or eight
+ * solves in lanes. These functions use the same arithmetic for scalars and vectors: the iterates of a
+ * solve are the same bit for bit with both, and do not depend on the C library of the machine. Errors
+ * are within 2 units in the last place of normal numbers; angles above 5e8 rad are passed to the C
+ * library. Reductions and coefficients are those of the Cephes library of Moshier (sin.c, atan.c).
  *
- * Expects the macros NAME(f), QUALIFIERS, INNER (for what is part of others), REAL and INTEGER, BITS(real) and REAL_OF(integer) for the
- * same bits, MASK(comparison) with all bits of a true entry set, ROOT, SMALL(real) whether all
- * entries are such as can be reduced here, and LIBRARY(f, x) for the others; without LIBRARY only what
- * needs neither is defined.
+ * Requires the macros NAME(f), QUALIFIERS, INNER (qualifiers of inlined functions), REAL and INTEGER,
+ * BITS(real) and REAL_OF(integer), which reinterpret bits, MASK(comparison) with all bits of a true
+ * entry set, ROOT, SMALL(real), which is true if all entries can be reduced here, and LIBRARY(f, x)
+ * for other entries; without LIBRARY only functions that do not use it are defined.
  */
 #define ALL(number) ((REAL) {0} + (number))
 #define PICK(mask, yes, no) REAL_OF(((mask) & BITS(yes)) | (~(mask) & BITS(no)))
 
-/* The nearest whole number, as the last bits of a sum: without a call in either form. */
+/* Adding this number leaves the nearest integer in the last bits of the sum, without a call. */
 #define SHIFT 6755399441055744.0
 #define SIGN ((INTEGER) {0} + INT64_MIN)
 
-/* Sine and cosine of the angle between x and the nearest whole quarter of a turn, whose number
- * stands in the last bits of `quarters`. */
-INNER REAL NAME(rest)(REAL x, REAL *cosine, INTEGER *quarters) {
+/* Sine and cosine of the difference between x and the nearest multiple of a quarter turn, whose
+ * number is in the last bits of `quarters`. */
+INNER REAL NAME(reduce)(REAL x, REAL *cosine, INTEGER *quarters) {
   const REAL k = x * 0.63661977236758134308 + SHIFT, whole = k - SHIFT;
   const REAL r = ((x - whole * 1.57079625129699707031) - whole * 7.54978941586159635335e-8)
                - whole * 5.39030285815811905290e-15;
@@ -36,27 +36,27 @@ INNER REAL NAME(rest)(REAL x, REAL *cosine, INTEGER *quarters) {
       + z * 1.58962301576546568060e-10)))));
 }
 
-/* Sine of an angle so many quarters of a turn beyond one whose sine and cosine are known. */
-INNER REAL NAME(beyond)(REAL s, REAL c, INTEGER quarters) {
+/* Sine of an angle with sine s and cosine c, increased by quarter turns. */
+INNER REAL NAME(shift)(REAL s, REAL c, INTEGER quarters) {
   const INTEGER odd = -(quarters & 1), below = -((quarters >> 1) & 1);
   return REAL_OF(BITS(PICK(odd, c, s)) ^ (below & SIGN));
 }
 
-/* Sine of x and `quarters` quarters of a turn. */
+/* Sine of x, increased by quarter turns. */
 QUALIFIERS REAL NAME(turned)(REAL x, int64_t quarters) {
   REAL c;
   INTEGER k;
-  const REAL s = NAME(rest)(x, &c, &k);
-  return NAME(beyond)(s, c, k + quarters);
+  const REAL s = NAME(reduce)(x, &c, &k);
+  return NAME(shift)(s, c, k + quarters);
 }
 
 /* Sine and cosine of x, if it can be reduced here. */
 INNER void NAME(both)(REAL x, REAL *sine, REAL *cosine) {
   REAL c;
   INTEGER k;
-  const REAL s = NAME(rest)(x, &c, &k);
-  *sine = NAME(beyond)(s, c, k);
-  *cosine = NAME(beyond)(s, c, k + 1);
+  const REAL s = NAME(reduce)(x, &c, &k);
+  *sine = NAME(shift)(s, c, k);
+  *cosine = NAME(shift)(s, c, k + 1);
 }
 
 #ifdef LIBRARY
@@ -73,23 +73,23 @@ QUALIFIERS void NAME(turns)(REAL x, REAL *sine, REAL *cosine) {
 }
 #endif
 
-/* Angle of (x, y): that of the smaller coordinate over the larger, which is at most 1, or by
- * tan(a - pi / 4) = (t - 1) / (t + 1) beyond 0.66; then by symmetry. */
+/* Angle of (x, y): the arctangent of the smaller coordinate over the larger, which is at most 1; above
+ * 0.66 with tan(a - pi / 4) = (t - 1) / (t + 1); then by symmetry. */
 QUALIFIERS REAL NAME(atan2)(REAL y, REAL x) {
   const REAL wide = REAL_OF(BITS(x) & ~SIGN), high = REAL_OF(BITS(y) & ~SIGN);
   const INTEGER steep = MASK(high > wide);
-  const REAL large = PICK(steep, high, wide), less = PICK(steep, wide, high);
-  const INTEGER beyond = MASK(less > large * 0.66), none = MASK(large == 0.0);
-  const REAL above = PICK(beyond, less - large, less);
-  const REAL below = PICK(beyond, less + large, PICK(none, ALL(1.0), large));
+  const REAL large = PICK(steep, high, wide), small = PICK(steep, wide, high);
+  const INTEGER exceeds_limit = MASK(small > large * 0.66), none = MASK(large == 0.0);
+  const REAL above = PICK(exceeds_limit, small - large, small);
+  const REAL below = PICK(exceeds_limit, small + large, PICK(none, ALL(1.0), large));
   const REAL t = above / below, z = t * t;
   const REAL p = (((-8.750608600031904122785e-1 * z - 1.615753718733365076637e1) * z
       - 7.500855792314704667340e1) * z - 1.228866684490136173410e2) * z - 6.485021904942025371773e1;
   const REAL q = ((((z + 2.485846490142306297962e1) * z + 1.650270098316988542046e2) * z
       + 4.328810604912902668951e2) * z + 4.853903996359136964868e2) * z + 1.945506571482613964425e2;
-  /* What pi has beyond a double is added with the small part. */
-  const REAL rest = t * (z * p / q) + REAL_OF(beyond & BITS(ALL(3.0616169978683830e-17)));
-  REAL angle = REAL_OF(beyond & BITS(ALL(0.78539816339744830962))) + (t + rest);
+  /* The part of pi below the precision of a double is added with the small part. */
+  const REAL rest = t * (z * p / q) + REAL_OF(exceeds_limit & BITS(ALL(3.0616169978683830e-17)));
+  REAL angle = REAL_OF(exceeds_limit & BITS(ALL(0.78539816339744830962))) + (t + rest);
   angle = PICK(steep, 1.57079632679489661923 - (angle - 6.123233995736766e-17), angle);
   angle = PICK(BITS(x) >> 63, 3.14159265358979323846 - (angle - 1.2246467991473532e-16), angle);
   return REAL_OF(BITS(angle) | (BITS(y) & SIGN));

@@ -1,4 +1,4 @@
-/* The forms of elementary.c for one number; code below that calls the C library's calls them. */
+/* Definitions of elementary.c for one number; emitted code calls these instead of the C library. */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>

@@ -1,4 +1,4 @@
-/* The forms of elementary.c for FEW numbers of one solve, two or four. */
+/* Definitions of elementary.c for FEW numbers of one solve, two or four. */
 #ifndef FEW_NAMED
 #define FEW_JOINED(f, count) own_##f##_##count
 #define FEW_NAMED(f, count) FEW_JOINED(f, count)
@@ -7,7 +7,7 @@
 typedef double FEW_NAMED(reals, FEW) __attribute__((vector_size(FEW * 8)));
 typedef int64_t FEW_NAMED(whole, FEW) __attribute__((vector_size(FEW * 8)));
 
-/* No vector goes from function to function: how it would is another matter on each machine. */
+/* No function has a vector argument, because calling conventions for vectors differ by machine. */
 #define NAME(f) FEW_NAMED(f, FEW)
 #define QUALIFIERS static inline __attribute__((always_inline, unused))
 #define INNER QUALIFIERS

@@ -1,4 +1,4 @@
-/* The forms of elementary.c for vectors. */
+/* Definitions of elementary.c for vectors. */
 #define NAME(f) lanes_##f
 #define QUALIFIERS static __attribute__((unused, noinline)) LANES_TARGET
 #define INNER static inline __attribute__((always_inline, unused)) LANES_TARGET

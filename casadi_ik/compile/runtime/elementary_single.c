@@ -1,6 +1,6 @@
-/* Sines, cosines and arc functions in single precision: what elementary.c is in double.
+/* Sines, cosines and arc functions in single precision, like elementary.c in double precision.
  *
- * Arithmetic without branches, within 2 (sines) and 4 (arcs) units in the last place; angles beyond 8192 rad go to the C
+ * Arithmetic without branches, within 2 (sines) and 4 (arcs) units in the last place; angles above 8192 rad go to the C
  * library. Reductions and coefficients are those of Moshier's Cephes library (sinf.c, atanf.c).
  */
 #include <math.h>
@@ -44,19 +44,19 @@ QUALIFIERS float own_cos(float x) { return fabsf(x) < 8192.0f ? own_turned(x, 1)
 QUALIFIERS float own_tan(float x) { return own_sin(x) / own_cos(x); }
 
 /* Angle of (x, y): that of the smaller coordinate over the larger, which is at most 1, or by
- * tan(a - pi / 4) = (t - 1) / (t + 1) beyond tan(pi / 8); then by symmetry. */
+ * tan(a - pi / 4) = (t - 1) / (t + 1) above tan(pi / 8); then by symmetry. */
 QUALIFIERS float own_atan2(float y, float x) {
   const float wide = fabsf(x), high = fabsf(y);
   const int32_t steep = MASK(high > wide);
-  const float large = PICK(steep, high, wide), less = PICK(steep, wide, high);
-  const int32_t beyond = MASK(less > large * 0.41421356237f), none = MASK(large == 0.0f);
-  const float above = PICK(beyond, less - large, less);
-  const float below = PICK(beyond, less + large, PICK(none, 1.0f, large));
+  const float large = PICK(steep, high, wide), small = PICK(steep, wide, high);
+  const int32_t exceeds_limit = MASK(small > large * 0.41421356237f), none = MASK(large == 0.0f);
+  const float above = PICK(exceeds_limit, small - large, small);
+  const float below = PICK(exceeds_limit, small + large, PICK(none, 1.0f, large));
   const float t = above / below, z = t * t;
   const float rest = t * z * (-3.33329491539e-1f + z * (1.99777106478e-1f
       + z * (-1.38776856032e-1f + z * 8.05374449538e-2f)));
-  /* What pi has beyond a float is added with the small part. */
-  float angle = own_float(beyond & own_bits(0.785398163397448310f)) + (t + rest);
+  /* The part of pi below the precision of a float is added with the small part. */
+  float angle = own_float(exceeds_limit & own_bits(0.785398163397448310f)) + (t + rest);
   angle = PICK(steep, 1.57079632679489662f - (angle + 4.371139000186241e-8f), angle);
   angle = PICK(own_bits(x) >> 31, 3.14159265358979324f - (angle + 8.742278000372482e-8f), angle);
   return own_float(own_bits(angle) | (own_bits(y) & INT32_MIN));

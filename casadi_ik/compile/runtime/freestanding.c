@@ -1,14 +1,14 @@
-/* What common.c is, without heap, locks and clock: for solvers that stand alone.
+/* Definitions of common.c without heap, locks and clock, for standalone solvers.
  *
- * A driver's function gets a second argument `memory`, room for the largest of them.
+ * The entry point of a driver has a second argument `memory`, large enough for every driver.
  */
 #include <string.h>
 
 #define FREESTANDING
 
-enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, GOES_ON = 3, FEW_LEFT = 4 };
+enum { DONE = 0, SLICE_OVER = 1, ROWS_FULL = 2, CONTINUES = 3, FEW_LEFT = 4 };
 
-/* Expects the macros NAMED and MEMORY: the driver's name and the type of its memory. */
+/* Requires the macros NAMED and MEMORY: name and memory type of the driver. */
 #define DRIVER(name, work) int NAMED(work *job, MEMORY *memory)
 #define CLOCK_INTERVAL 16
 #define monotonic() ((scalar) 0)

@@ -22,7 +22,7 @@ static LANES_TARGET scalar displacement_bound(const guard_job *job, const scalar
   return bound;
 }
 
-static LANES_TARGET void place(placing *space) {
+static LANES_TARGET void place_robot(placing *space) {
   space->space.arg[0] = space->q;
   space->space.res[0] = space->placed;
   STEP(space->space.arg, space->space.res, (1 << LANES) - 1);
@@ -32,7 +32,7 @@ static LANES_TARGET void place(placing *space) {
 static LANES_TARGET void place_at(placing *space, const scalar *q) {
   int k;
   for (k = 0; k < N_Q; ++k) space->q[k] = SPREAD(q[k]);
-  place(space);
+  place_robot(space);
 }
 
 /* Returns lower bounds of a pair's distance: the distances of its bounding balls. */
@@ -69,7 +69,7 @@ static LANES_TARGET void list_nearby_pairs(const guard_job *job, placing *space,
     bound = sqrt(square) - radii;
     if (!(bound >= exact_below)) {
       bound = exact_below;
-      if (apart(scene, pair, space->placed, SPREAD(exact_below), space->lines, &distance)) {
+      if (pair_distance(scene, pair, space->placed, SPREAD(exact_below), space->lines, &distance)) {
         bound = lanes_at(distance, 0);
       }
     }
@@ -136,7 +136,7 @@ LANES_TARGET DRIVER(keep_away, guard_job) {
   placing space;
   scalar distances[OBSTACLES + 1];
   int64_t nearest[OBSTACLES + 1], count = OBSTACLES, i, k;
-  int motor = 0, lane, outcome = set_up(&space.space, room(scene));
+  int motor = 0, lane, outcome = set_up(&space.space, work_size(scene));
   if (outcome != DONE) return outcome;
   lay_out(&space, scene);
   select_candidates(job, &space, pairs, job->goal, job->goal, job->avoided_distance);
@@ -144,7 +144,7 @@ LANES_TARGET DRIVER(keep_away, guard_job) {
   if (pairs->n_candidates) place_at(&space, job->goal);
   for (i = 0; i < pairs->n_candidates; ++i) {
     lanes distance;
-    if (apart(scene, pairs->candidates[i], space.placed, SPREAD(job->avoided_distance), space.lines,
+    if (pair_distance(scene, pairs->candidates[i], space.placed, SPREAD(job->avoided_distance), space.lines,
               &distance)) {
       insert_nearest(distances, nearest, pairs->candidates[i], lanes_at(distance, 0));
     }
@@ -166,10 +166,10 @@ LANES_TARGET DRIVER(keep_away, guard_job) {
     if (!n_nudged) break;
     for (k = 0; k < N_Q; ++k) space.q[k] = SPREAD(job->goal[k]);
     for (lane = 0; lane < n_nudged; ++lane) ((scalar *) (space.q + nudged[lane]))[lane] += job->nudge;
-    place(&space);
+    place_robot(&space);
     for (i = 0; i < count; ++i) {
       lanes distance;
-      apart(scene, nearest[i], space.placed, SPREAD(INFINITY), space.lines, &distance);
+      pair_distance(scene, nearest[i], space.placed, SPREAD(INFINITY), space.lines, &distance);
       for (lane = 0; lane < n_nudged; ++lane) {
         job->slopes[i * N_Q + nudged[lane]] = (lanes_at(distance, lane) - distances[i]) / job->nudge;
       }
@@ -226,7 +226,7 @@ static LANES_TARGET int find_touching(const guard_job *job, placing *space, int6
   for (lane = 0; lane < LANES; ++lane) {
     if (!(lanes_at(motion_bounds, lane) <= largest_bound)) largest_bound = lanes_at(motion_bounds, lane);
   }
-  place(space);
+  place_robot(space);
   for (i = 0; i < n_pairs; ++i) {
     const int64_t pair = pairs->candidates[i];
     const scalar *lever = job->levers + pair * ROW;
@@ -241,7 +241,7 @@ static LANES_TARGET int find_touching(const guard_job *job, placing *space, int6
     for (lane = 0; lane < LANES; ++lane) {
       if (!(lanes_at(motion, lane) <= largest)) largest = lanes_at(motion, lane);
     }
-    if (!apart(job->scene, pair, space->placed, SPREAD(job->required_distance + largest / 2),
+    if (!pair_distance(job->scene, pair, space->placed, SPREAD(job->required_distance + largest / 2),
                space->lines, &distance)) {
       continue;
     }
@@ -272,12 +272,12 @@ static LANES_TARGET int find_touching(const guard_job *job, placing *space, int6
   return any_touch;
 }
 
-/* Computes the largest tried part of the wanted step after which the robot is free and can come to rest
- * free. Motors of a pair that comes too near make a smaller share, and brake finally; braking of all
- * motors of a pair was checked in the cycle before. */
+/* Compute the largest share of the requested step after which the robot is collision-free and can stop
+ * without collision. The motors of a pair that gets too close take smaller shares and finally brake;
+ * braking of all motors of a pair was checked in the previous cycle. */
 LANES_TARGET DRIVER(stop_in_time, guard_job) {
   placing space;
-  int attempts[N_Q] = {0}, is_blocking[N_Q], k, is_reduced, outcome = set_up(&space.space, room(job->scene));
+  int attempts[N_Q] = {0}, is_blocking[N_Q], k, is_reduced, outcome = set_up(&space.space, work_size(job->scene));
   if (outcome != DONE) return outcome;
   lay_out(&space, job->scene);
   do {

@@ -30,7 +30,7 @@ typedef struct {
   const scalar *wanted_step;   /* next step without obstacles */
   const scalar *change;        /* largest change of a step from cycle to cycle */
   scalar required_distance;    /* distance that every pair must keep */
-  const scalar *shares;        /* shares of the wanted step that are tried in turn before braking */
+  const scalar *shares;        /* shares of the requested step that are tried successively before braking */
   int64_t n_shares;
   scalar *share;               /* share of each motor; 0: the motor brakes */
   scalar *step, *q_rest;       /* the step, and the positions at rest after it */

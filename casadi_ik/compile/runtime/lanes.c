@@ -1,7 +1,7 @@
-/* What the emitter writes (`emitter.py`), for vectors whose entries belong to LANES solves, four or
- * eight. Every entry is computed as one double would be (no contraction, the same elementary
- * functions), so a solve's iterates are bit for bit those it has alone. Vectors are those of gcc and
- * clang. Needs the elementary functions for one number.
+/* Definitions for emitted code (`emitter.py`) in vectors whose entries belong to LANES solves, four
+ * or eight. Every entry is computed like a single double (no contraction, the same elementary
+ * functions), so that the iterates of a solve do not depend on the other lanes. Requires vector
+ * extensions of gcc or clang, and the elementary functions for one number.
  */
 #include <math.h>
 #include <stdint.h>
@@ -11,7 +11,7 @@ typedef double lanes __attribute__((vector_size(LANES * sizeof(double))));
 typedef int64_t lane_mask __attribute__((vector_size(LANES * sizeof(double))));
 typedef lanes real;
 typedef lane_mask mask;
-typedef double scalar; /* of one solve */
+typedef double scalar; /* number of one solve */
 
 #if !defined(__x86_64__)
 #define LANES_TARGET
@@ -185,11 +185,11 @@ static __attribute__((unused)) int lanes_in(const int *branch, int b) {
   return bits;
 }
 
-static __attribute__((unused)) void lanes_keep(int mine, const lanes *own, int count, lanes *result) {
+static __attribute__((unused)) void lanes_keep(int branch_lanes, const lanes *own, int count, lanes *result) {
   int i, k;
   if (!result) return;
   for (i = 0; i < LANES; ++i) {
-    if (!(mine >> i & 1)) continue;
+    if (!(branch_lanes >> i & 1)) continue;
     for (k = 0; k < count; ++k) {
       ((double *) result)[k * LANES + i] = ((const double *) own)[k * LANES + i];
     }

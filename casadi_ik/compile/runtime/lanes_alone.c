@@ -1,4 +1,4 @@
-/* What lanes.c is, for one solve at a time in plain C: for solvers that stand alone. */
+/* Definitions of lanes.c for one solve in standard C, for standalone solvers. */
 #define LANES 1
 #define LANES_TARGET
 #define LANES_INLINE static inline

@@ -12,7 +12,7 @@ typedef struct {
 } key_pair;
 
 #define PAIRS ((N_KEY + 1) / 2)
-#define FAR INT32_MAX
+#define MAX_DISTANCE INT32_MAX
 
 #define UNROLLED LOOPS static inline __attribute__((always_inline, unused))
 
@@ -43,7 +43,7 @@ UNROLLED void measure(const lookup_job *job, const key_pair *pairs, int32_t *dis
 }
 
 UNROLLED int32_t min_of(const int32_t *values, int64_t count) {
-  int32_t minimum = FAR;
+  int32_t minimum = MAX_DISTANCE;
   int64_t j;
   for (j = 0; j < count; ++j) minimum = values[j] < minimum ? values[j] : minimum;
   return minimum;
@@ -51,19 +51,19 @@ UNROLLED int32_t min_of(const int32_t *values, int64_t count) {
 
 /* Select the nearest rows in order, the first among equals: first the tile, then the row. */
 UNROLLED void select_nearest(const lookup_job *job, int32_t *distance, int32_t *nearest,
-                             int64_t *found) {
+                             int64_t *nearest_rows) {
   const int64_t tiles = (job->rows + TILE - 1) / TILE;
-  int64_t i, j, place;
-  for (j = job->rows; j < tiles * TILE; ++j) distance[j] = FAR;
+  int64_t i, j, rank;
+  for (j = job->rows; j < tiles * TILE; ++j) distance[j] = MAX_DISTANCE;
   for (i = 0; i < tiles; ++i) nearest[i] = min_of(distance + i * TILE, TILE);
-  for (place = 0; place < job->wanted; ++place) {
+  for (rank = 0; rank < job->n_nearest; ++rank) {
     const int32_t best = min_of(nearest, tiles);
     int32_t *tile;
     for (i = 0; nearest[i] != best; ++i) {}
     tile = distance + i * TILE;
     for (j = 0; tile[j] != best; ++j) {}
-    found[place] = i * TILE + j;
-    tile[j] = FAR;
+    nearest_rows[rank] = i * TILE + j;
+    tile[j] = MAX_DISTANCE;
     nearest[i] = min_of(tile, TILE);
   }
 }
@@ -112,9 +112,9 @@ static void measure_wide(const lookup_job *job, const key_pair *pairs, int32_t *
 
 LOOPS __attribute__((target(TARGET)))
 static void find(const lookup_job *job, const key_pair *pairs, int32_t *distance, int32_t *nearest,
-                 int64_t *found) {
+                 int64_t *nearest_rows) {
   measure_wide(job, pairs, distance);
-  select_nearest(job, distance, nearest, found);
+  select_nearest(job, distance, nearest, nearest_rows);
 }
 #else
 #if defined(FREESTANDING) && (defined(__SSE2__) || defined(__wasm_simd128__))
@@ -165,9 +165,9 @@ static void measure_eight(const lookup_job *job, const key_pair *pairs, int32_t 
 #endif
 
 LOOPS static void find(const lookup_job *job, const key_pair *pairs, int32_t *distance,
-                       int32_t *nearest, int64_t *found) {
+                       int32_t *nearest, int64_t *nearest_rows) {
   measure(job, pairs, distance);
-  select_nearest(job, distance, nearest, found);
+  select_nearest(job, distance, nearest, nearest_rows);
 }
 #endif
 
@@ -192,7 +192,7 @@ DRIVER(lookup, lookup_job) {
     space.res[0] = space.extra;
     STEP(space.arg, space.res, 0);
     quantize_key(space.extra, pairs);
-    find(job, pairs, distance, nearest, job->found + job->next * job->wanted);
+    find(job, pairs, distance, nearest, job->nearest_rows + job->next * job->n_nearest);
   }
   give_back(&space);
   return outcome;

@@ -7,14 +7,14 @@
  * A step in lanes is cheapest if all lanes take the same branch. There are therefore more slots than
  * lanes: a lane whose solve ends or changes its stage is refilled with a solve in the current stage,
  * and when more solves wait in another stage than lanes are busy, all lanes switch to that stage. Rows
- * are stored in the order of computation; `places` holds their solve and iteration.
+ * are stored in the order of computation; `row_owners` holds their solve and iteration.
  *
  * A step depends on state and parameters alone, so a state that repeats bit for bit repeats forever;
  * such a solve ends as REPEATED. Cycles are detected as by Brent (1980): every state is compared with
  * that of the last iteration whose number is a power of two. The comparison starts at FIRST_MARK,
  * since most solves end earlier and storing states costs time.
  *
- * Requires the macros N_STATE, N_PARAMETERS, N_SEATED (number of parameters that lanes load; a step of
+ * Requires the macros N_STATE, N_PARAMETERS, N_LOADED (number of parameters that lanes load; a step of
  * stages reads the others through its third argument), N_RECORD, ROW_BYTES, RUNNING, NON_FINITE,
  * REPEATED, CODE_LIMIT, SLOTS, FIRST_MARK, STAGE (index of the stage in the state; -1 without
  * stages), STEP_STAGES (number of stages) and the function store_row(record, row). All data that must survive a pause are in the job: after
@@ -77,7 +77,7 @@ static void enqueue(queues *all, const loop_job *job, int slot) {
 
 /* Returns the iterations since the last start of the solve in a slot. */
 static int64_t iterations_since_start(const loop_job *job, int slot) {
-  return job->iterations[job->slots[slot]] - job->begun[slot];
+  return job->iterations[job->slots[slot]] - job->iterations_before[slot];
 }
 
 /* Refills a slot whose solve has ended: asks the method for a restart, otherwise loads the next
@@ -92,12 +92,12 @@ static void refill_slot(lane_set *b, queues *all, loop_job *job, int slot) {
     if (job->follow) {
       int32_t *status = job->status + job->slots[slot];
       code = job->follow(job->method, slot, job->slots[slot], status);
-      if (code == GOES_ON) *status = RUNNING;
+      if (code == CONTINUES) *status = RUNNING;
     } else if (is_new) {
-      code = GOES_ON;
+      code = CONTINUES;
     }
-    if (code == GOES_ON) {
-      job->begun[slot] = job->iterations[job->slots[slot]];
+    if (code == CONTINUES) {
+      job->iterations_before[slot] = job->iterations[job->slots[slot]];
       enqueue(all, job, slot);
       return;
     }
@@ -116,7 +116,7 @@ static void load_lane(lane_set *b, const loop_job *job, int lane, int slot) {
 #if LANES == 1
   b->parameters = (lanes *) parameters;
 #else
-  for (k = 0; k < N_SEATED; ++k) LANE(b->parameters, k, lane) = parameters[k];
+  for (k = 0; k < N_LOADED; ++k) LANE(b->parameters, k, lane) = parameters[k];
 #endif
   b->own[lane] = parameters;
   b->slot[lane] = slot;
@@ -160,9 +160,9 @@ static void write_row(const lane_set *b, loop_job *job, int lane, int64_t solve)
   scalar record_values[N_RECORD + 1];
   int k;
   for (k = 0; k < N_RECORD; ++k) record_values[k] = LANE(b->record, k, lane);
-  job->places[2 * job->used] = solve;
-  job->places[2 * job->used + 1] = job->iterations[solve] - 1;
-  store_row(record_values, job->rows + ROW_BYTES * job->used++);
+  job->row_owners[2 * job->n_rows] = solve;
+  job->row_owners[2 * job->n_rows + 1] = job->iterations[solve] - 1;
+  store_row(record_values, job->rows + ROW_BYTES * job->n_rows++);
 }
 
 /* Tests which lanes have a finite state: x * 0 is 0 for finite x and NaN otherwise. Sums need no
@@ -208,7 +208,7 @@ static int finish_iteration(lane_set *b, queues *all, loop_job *job, int lane, s
   scalar *mark = job->mark + slot * N_STATE;
   int32_t status;
   int k;
-  /* A NaN code fails this test as well. */
+  /* A NaN code fails this test too. */
   if (!(code > -CODE_LIMIT && code < CODE_LIMIT) || !finite) {
     end_solve(b, all, job, lane, NON_FINITE, b->next);
     return 1;
@@ -263,11 +263,11 @@ static void start_loop(lane_set *b, queues *all, loop_job *job, lanes *memory) {
 
 /* Returns 1 if so few solves remain that the loop without lanes is faster. */
 static int is_few(const loop_job *job) {
-  int64_t left = 0;
+  int64_t remaining = 0;
   int slot;
   if (LANES == 1 || job->solve < job->count) return 0;
-  for (slot = 0; slot < job->slot_count; ++slot) left += job->slots[slot] != EMPTY;
-  return left < job->fewest;
+  for (slot = 0; slot < job->slot_count; ++slot) remaining += job->slots[slot] != EMPTY;
+  return remaining < job->min_solves;
 }
 
 LANES_TARGET DRIVER(loop, loop_job) {
@@ -284,16 +284,16 @@ LANES_TARGET DRIVER(loop, loop_job) {
   start_loop(&b, &all, job, (lanes *) space.extra);
 
   while (b.outcome == DONE && (busy = fill(&b, &all, job))) {
-    int changed = 0, wanted = 0;
+    int changed = 0, active_lanes = 0;
     if (is_few(job)) b.outcome = FEW_LEFT;
     for (lane = 0; lane < LANES; ++lane) {
       solves[lane] = b.slot[lane] == EMPTY ? EMPTY : job->slots[b.slot[lane]];
-      if (solves[lane] != EMPTY) wanted |= 1 << lane;
+      if (solves[lane] != EMPTY) active_lanes |= 1 << lane;
     }
     while (!changed) {
-      if (job->rows && job->used + LANES > job->capacity) b.outcome = ROWS_FULL;
+      if (job->rows && job->n_rows + LANES > job->capacity) b.outcome = ROWS_FULL;
       if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) b.outcome = SLICE_OVER;
-      if (job->left <= 0) b.outcome = SLICE_OVER;
+      if (job->remaining_steps <= 0) b.outcome = SLICE_OVER;
       if (b.outcome != DONE) break;
       space.arg[0] = (const real *) b.now;
       space.arg[1] = (const real *) b.parameters;
@@ -301,8 +301,8 @@ LANES_TARGET DRIVER(loop, loop_job) {
       space.res[0] = (real *) b.next;
       space.res[1] = job->rows ? (real *) b.record : NULL;
       space.res[2] = (real *) &code;
-      STEP(space.arg, space.res, wanted);
-      --job->left;
+      STEP(space.arg, space.res, active_lanes);
+      --job->remaining_steps;
       check_finite(&b, finite);
       last = b.now;
       b.now = b.next;

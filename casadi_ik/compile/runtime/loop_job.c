@@ -13,21 +13,21 @@ typedef struct {
   int32_t *status;             /* (count), initially RUNNING; with `follow` UNBEGUN */
   scalar *seconds;             /* (count), zeros at the start */
   int64_t *slots;              /* (slot_count) solve in each slot; -1: none */
-  int64_t *begun;              /* (slot_count) iterations of the solve before its last start */
+  int64_t *iterations_before;              /* (slot_count) iterations of the solve before its last start */
   scalar *mark;                /* (slot_count, N_STATE) marked states for the detection of cycles */
   int64_t slot_count;          /* at most SLOTS */
   unsigned char *rows;         /* (capacity) rows; NULL without a trace */
-  int64_t *places;             /* (capacity, 2) solve and iteration of each row */
+  int64_t *row_owners;             /* (capacity, 2) solve and iteration of each row */
   int64_t capacity;
-  int64_t used;                /* number of rows written */
+  int64_t n_rows;                /* number of rows written */
   int64_t count;               /* number of solves */
   int64_t solve;               /* next solve to start */
   int64_t max_iterations;      /* per start, at least 1 */
-  int64_t left;                /* steps until SLICE_OVER */
-  int64_t fewest;              /* the loop with lanes stops when fewer solves remain */
+  int64_t remaining_steps;                /* steps until SLICE_OVER */
+  int64_t min_solves;              /* the loop with lanes stops when fewer solves remain */
   scalar slice;                /* time until SLICE_OVER, so that Python handles signals [s] */
   /* Called when the solve in a slot has ended (with its status; RUNNING at max_iterations) or is new
-   * (UNBEGUN). Returns GOES_ON after writing a start, DONE, or the reason to stop the loop. */
+   * (UNBEGUN). Returns CONTINUES after writing a start, DONE, or the reason to stop the loop. */
   int (*follow)(void *method, int64_t slot, int64_t solve, int32_t *status);
   void *method;
 } loop_job;

@@ -1,4 +1,4 @@
-/* LOOPS marks functions whose loops gcc shall turn into vector operations. */
+/* LOOPS marks functions whose loops gcc should vectorise. */
 #ifndef LOOPS
 #if defined(__GNUC__) && !defined(__clang__)
 #define LOOPS __attribute__((optimize("O3")))

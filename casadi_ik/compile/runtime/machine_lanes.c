@@ -1,16 +1,16 @@
-/* How wide the machine's registers are, asked of the machine itself: not every compiler brings the
- * library behind __builtin_cpu_supports. */
+/* Width of the vector registers, read with cpuid: not every compiler provides the library that
+ * __builtin_cpu_supports requires. */
 #if defined(__x86_64__)
 #include <cpuid.h>
 
-/* Bits that the system saves of a thread: it must know the registers as well. */
+/* Register states that the operating system saves for a thread. */
 static unsigned saved_registers(void) {
   unsigned low, high;
   __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0));
   return low;
 }
 
-/* 512 with all of AVX-512 F, DQ, BW, VL; 256 with AVX2; else 128. */
+/* Return 512 with AVX-512 F, DQ, BW and VL, 256 with AVX2, otherwise 128. */
 static int register_bits(void) {
   const unsigned wide = 1u << 16 | 1u << 17 | 1u << 30 | 1u << 31;
   unsigned a, b, c, d, saved;
@@ -22,7 +22,7 @@ static int register_bits(void) {
 }
 #endif
 
-/* How many solves this machine can make side by side, 0: vectors are of no use. */
+/* Return the number of lanes of this machine; 0: no useful vectors. */
 #if defined(_WIN32)
 __declspec(dllexport)
 #else

@@ -1,4 +1,4 @@
-/* A function over a batch: expects the macros N_IN, N_OUT. */
+/* Evaluate a function for a batch of samples. Requires the macros N_IN and N_OUT. */
 
 DRIVER(map, map_job) {
   workspace space;

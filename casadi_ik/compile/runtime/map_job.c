@@ -1,14 +1,14 @@
-/* What `casadi_ik_map` and `casadi_ik_map_lanes` work on. */
+/* Job of a map (map.c, map_lanes.c). */
 #ifndef SINGLE
 typedef double scalar;
 #endif
 
 typedef struct {
   const scalar **inputs;       /* first sample of each input */
-  const int64_t *input_steps;  /* numbers from one sample to the next, 0 = the same for all */
+  const int64_t *input_steps;  /* distance between consecutive samples; 0: shared by all samples */
   scalar **outputs;
   const int64_t *output_steps;
-  int64_t count;               /* samples */
-  int64_t next;                /* first sample not yet done */
-  scalar slice;                /* [s] after which Python gets a look at its signals */
+  int64_t count;               /* number of samples */
+  int64_t next;                /* next sample to compute */
+  scalar slice;                /* time until SLICE_OVER, so that Python handles signals [s] */
 } map_job;

@@ -1,21 +1,21 @@
-/* map.c for LANES samples side by side: see there. Where the last turn has less, its last
- * sample is there several times.
+/* Evaluate a function for a batch of samples, LANES samples per call (see map.c). The last call
+ * repeats the last sample in unused lanes.
  *
- * Expects the macros N_IN, N_OUT, SIZES_IN and SIZES_OUT (numbers of each, as initialisers), TOTAL
- * (their sum).
+ * Requires the macros N_IN, N_OUT, SIZES_IN and SIZES_OUT (numbers per input and output, as
+ * initialisers), and TOTAL (their sum).
  */
 
 LANES_TARGET DRIVER(map_lanes, map_job) {
   static const int sizes_in[] = SIZES_IN, sizes_out[] = SIZES_OUT;
   workspace space;
-  lanes *inputs[N_IN], *outputs[N_OUT], *place;
+  lanes *inputs[N_IN], *outputs[N_OUT], *next_values;
   int64_t ticks = 0, sample[LANES];
   scalar limit;
   int i, k, lane, outcome = set_up(&space, TOTAL);
   if (outcome != DONE) return outcome;
-  place = space.extra;
-  for (i = 0; i < N_IN; place += sizes_in[i++]) inputs[i] = place;
-  for (i = 0; i < N_OUT; place += sizes_out[i++]) outputs[i] = place;
+  next_values = space.extra;
+  for (i = 0; i < N_IN; next_values += sizes_in[i++]) inputs[i] = next_values;
+  for (i = 0; i < N_OUT; next_values += sizes_out[i++]) outputs[i] = next_values;
   limit = monotonic() + job->slice;
   for (; job->next < job->count; job->next += LANES) {
     if (++ticks % CLOCK_INTERVAL == 0 && monotonic() > limit) {

@@ -1,5 +1,5 @@
-/* What the emitter writes (`emitter.py`), for one number at a time: `real` is a double, or a float
- * where SINGLE is defined. Needs the elementary functions of the same precision. */
+/* Definitions for emitted code (`emitter.py`) with scalars: `real` is a double, or a float if SINGLE
+ * is defined. Requires the elementary functions of the same precision. */
 #ifdef SINGLE
 #include <tgmath.h>
 typedef float real;
@@ -13,7 +13,7 @@ typedef double real;
 #endif
 
 typedef int mask;
-typedef real scalar; /* of one solve; `real` may be a vector (lanes.c) */
+typedef real scalar; /* number of one solve; `real` may be a vector (lanes.c) */
 
 #define R(x) ((real) (x))
 #define LESS(x, y) ((x) < (y))
@@ -26,7 +26,7 @@ typedef real scalar; /* of one solve; `real` may be a vector (lanes.c) */
 
 #define real_sq(x) ((x) * (x))
 #define real_sign(x) ((x) < R(0.0) ? R(-1.0) : (x) > R(0.0) ? R(1.0) : (x))
-/* Of equal numbers the second, of a NaN the other: as glibc has it, without a call. */
+/* For equal numbers the second, for a NaN the other number, like glibc but inline. */
 #define real_fmax(x, y) ((y) != (y) ? (x) : (x) > (y) ? (x) : (y))
 #define real_fmin(x, y) ((y) != (y) ? (x) : (x) < (y) ? (x) : (y))
 #define real_fabs(x) fabs(x)
@@ -56,5 +56,5 @@ typedef real scalar; /* of one solve; `real` may be a vector (lanes.c) */
 #define real_atan(x) own_atan(x)
 #define real_atan2(y, x) own_atan2(y, x)
 
-/* Which branch an index takes, `last` for all that is not 0 ... last - 1. */
+/* Branch that an index selects: 0 ... last - 1, otherwise `last`. */
 #define branch_of(index, last) ((index) > R(-1.0) && (index) < R(last) ? (int) (index) : (last))

@@ -1,4 +1,4 @@
-/* Doubles into the storage types of a record; rows are packed, hence memcpy for every number.
+/* Conversion of doubles to the storage types of a record. Rows are packed, which requires memcpy.
  *
  * Defined for every double: f4 rounds to nearest and overflows to infinity (IEC 60559); the
  * integers drop the fraction and saturate, NaN becomes 0. `rows.py` does the same in numpy.

@@ -261,9 +261,9 @@ static int choose_arm(@PREFIX@_solver *solver, const scalar *lower, const scalar
   job.rounding = ROUNDING;
   job.min_limit_margin = MIN_LIMIT_MARGIN;
   job.count = 1;
-  job.chosen = arm;
+  job.best_arms = arm;
   job.score = &score;
-  job.tried = &n_arms;
+  job.arms_tried = &n_arms;
   job.memory = &solver->memory;
   if (casadi_ik_arm_search(&job) != DONE || !(score > -INFINITY)) return 0;
   for (i = 0; i < N_ARM; ++i) q[columns[i]] = arm[i];
@@ -335,9 +335,9 @@ static int choose_arms(@PREFIX@_solver *solver, const scalar *lower, const scala
   job.rounding = ROUNDING;
   job.min_limit_margin = MIN_LIMIT_MARGIN;
   job.count = 1;
-  job.chosen = arms;
+  job.best_arms = arms;
   job.score = score;
-  job.tried = &n_arms;
+  job.arms_tried = &n_arms;
   job.memory = &solver->memory;
   if (casadi_ik_arm_search(&job) != DONE) return 0;
   for (k = 0; k < job.n_groups; ++k) {

@@ -1,7 +1,7 @@
 /* Search for a solution of a target. */
 #include "@PREFIX@_parts.h"
 
-enum { DONE = 0, SLICE_OVER = 1, GOES_ON = 3 };
+enum { DONE = 0, SLICE_OVER = 1, CONTINUES = 3 };
 
 typedef @PREFIX@_solver search;
 

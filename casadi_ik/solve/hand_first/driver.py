@@ -181,9 +181,9 @@ class Searches:
         """
         self._first["loop_status"], self._first["max_restarts"] = status, rounds
         code = self._decide(self._address)
-        if code != DriverCode.GOES_ON:
+        if code != DriverCode.CONTINUES:
             check(self._name, code)
-        return code == DriverCode.GOES_ON
+        return code == DriverCode.CONTINUES
 
     def seeds(self, number: int) -> Array:
         """Return the seeds (candidates, hand) of a restart for the target in the arrays."""

@@ -220,7 +220,7 @@ static int finish_target(search *job, int32_t status) {
 }
 
 /* Decide what follows when the iterations of a target have ended, or before they begin (UNBEGUN).
- * Returns GOES_ON after starting a restart, DONE with the result, or SLICE_OVER if the restart
+ * Returns CONTINUES after starting a restart, DONE with the result, or SLICE_OVER if the restart
  * quota of this call is used up. */
 static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
   search *job = method;
@@ -234,7 +234,7 @@ static int follow(void *method, int64_t slot, int64_t solve, int32_t *status) {
   if (needs_restart) {
     --job->restart_quota;
     code = start_restart(job);
-    return code == DONE ? GOES_ON : code;
+    return code == DONE ? CONTINUES : code;
   }
   code = finish_target(job, *status);
   *status = (int32_t) job->status;
@@ -255,13 +255,13 @@ static int iterate(search *job, int64_t steps,
   loop.status = &status;
   loop.seconds = &seconds;
   loop.slots = &job->slot;
-  loop.begun = &job->begun;
+  loop.iterations_before = &job->iterations_before;
   loop.mark = job->mark;
   loop.slot_count = 1;
   loop.count = 1;
   loop.solve = job->slot < 0 ? 0 : 1;
   loop.max_iterations = BUDGET;
-  loop.left = steps;
+  loop.remaining_steps = steps;
   loop.slice = SLICE;
   loop.follow = next;
   loop.method = job;

@@ -105,17 +105,17 @@ static solve solve_of_lane(int lane, real *x, const real *p, const double *all_p
   return s;
 }
 
-/* Run one iteration; `wanted` has a bit for each lane that holds a solve (the macros of the graphs
- * pass it on). */
+/* Run one iteration; `active_lanes` has a bit for each lane with a solve, and is used by the macros
+ * of the graphs. */
 CODE void iterate(real *x, const real *p, const double *const *all_p, real *y, real *record,
-                  real *status, int wanted) {
+                  real *status, int active_lanes) {
   real results[N_RESULTS], hand[N_HAND + 1];
   int lane = 0, stage, side;
-  while (!(wanted >> lane & 1)) ++lane;
+  while (!(active_lanes >> lane & 1)) ++lane;
   stage = (int) solve_of_lane(lane, x, p, all_p[lane], y, results).x[STATE_PHASE * WIDTH];
   side = stage / SIDE_OFFSET;
   stage %= SIDE_OFFSET;
-#define EACH_LANE for (lane = 0; lane < WIDTH; ++lane) if (wanted >> lane & 1)
+#define EACH_LANE for (lane = 0; lane < WIDTH; ++lane) if (active_lanes >> lane & 1)
 #define SOLVE solve_of_lane(lane, x, p, all_p[lane], y, results)
   if (stage == CANDIDATE_STAGE) EACH_LANE before_candidate(SOLVE, (double *) hand + lane);
 #if N_STARTS

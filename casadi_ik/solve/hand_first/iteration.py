@@ -43,7 +43,7 @@ def iteration_graph(step: HandFirstStep) -> StepGraph:
         layouts.record,
         stage="phase",
         recipe=recipe(name, step.robot, layouts.candidates, layouts.kinds),
-        apart="postures",
+        c_only="postures",
         virtual=lambda: VirtualIteration(step),
     )
 

@@ -327,7 +327,7 @@ class MultiArmStep(HandFirstStep):
             matrix = ca.horzcat(trunk.rotation.T @ pose.rotation, trunk.inverse_apply(pose.origin))
             in_trunk += [ca.vec(matrix.T), ca.SX([0.0, 0.0, 0.0, 1.0])]
         outputs = with_cse(*(ca.densify(ca.vertcat(*poses)) for poses in (in_base, in_trunk)))
-        return FunctionGraph.of(ca.Function("palms", [q], outputs))
+        return FunctionGraph.from_function(ca.Function("palms", [q], outputs))
 
     def _palm_pose(self, s: dict[str, Expr], side: ArmHandSide) -> tuple[Expr, Expr]:
         return s[f"palm_rotation_{side.index}"], s[f"palm_origin_{side.index}"]

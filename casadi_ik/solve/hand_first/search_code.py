@@ -206,7 +206,7 @@ class SearchPlan:
             "preference_dropped": (integer, None, "1 = restarts are repeated without preference"),
             "restart_quota": (integer, None, "restarts that this call may still begin"),
             "slot": (integer, None, "of the loop, -1 = none"),
-            "begun": (integer, None, "iterations before this restart"),
+            "iterations_before": (integer, None, "iterations before this restart"),
             "loop_status": (integer, None, "status with which the iterations ended"),
             "paused": (integer, None, "1 = the next call continues the search"),
             "state": (double, state, "of the loop"),

@@ -23,9 +23,9 @@ static int look_up_rows(search *job, int table, int64_t count) {
   look.inputs = inputs;
   look.input_steps = ALONE;
   look.tiles = TILES(table);
-  look.found = job->seed_rows;
+  look.nearest_rows = job->seed_rows;
   look.rows = TABLE_ROWS[table];
-  look.wanted = count;
+  look.n_nearest = count;
   look.count = 1;
   return LOOK_UP(&look);
 }
