@@ -20,6 +20,7 @@ from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
 from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.writing import atomic_write
+from casadi_ik.logs.renamed import warn_renamed
 from casadi_ik.model.objects import GraspObject, load_object
 from casadi_ik.model.shapes import MeshShape
 from casadi_ik.planning.touch.nearest import NearestPoints, TriangleTree
@@ -158,6 +159,12 @@ class Surface(RecordReprMixin):
     corners: Array
     parameters: SurfaceParameters
     notes: tuple[str, ...] = ()
+
+    @property
+    def inside(self) -> Bools:
+        """Deprecated name of `fits_pad`."""
+        warn_renamed("Surface.inside", "Surface.fits_pad", stacklevel=3)
+        return self.fits_pad
 
     @cached_property
     def size(self) -> float:

@@ -19,6 +19,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import checked_quaternion
 from casadi_ik.kinematics import dual_quaternion as dq
 from casadi_ik.kinematics.screws import finger_chain
+from casadi_ik.logs.renamed import warn_renamed
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.papers.chandra.calibration.model import HandModel
 
@@ -50,6 +51,12 @@ class Measurements:
 
     def __len__(self) -> int:
         return len(self.fingers)
+
+    @property
+    def turned(self) -> NDArray[np.bool_]:
+        """Deprecated name of `has_orientation`."""
+        warn_renamed("Measurements.turned", "Measurements.has_orientation", stacklevel=3)
+        return self.has_orientation
 
     @property
     def measured_fingers(self) -> tuple[str, ...]:
