@@ -220,6 +220,10 @@ class NearestSearch:
         self._seeds = SeedTable(trials.robot, settings.seeds)
         self._compiled = compiled
 
+    def with_settings(self, settings: NearestSettings) -> NearestSearch:
+        """Return a search with other settings."""
+        return NearestSearch(self._trials, self._step.kinds, self._compiled, settings)
+
     @cached_property
     def _kernel(self) -> LoopKernel:
         return LoopKernel(self._step.graph, self._compiled)
@@ -258,10 +262,16 @@ class NearestSearch:
             distance = np.where(is_free, distance, IN_COLLISION * (1 + distance))
         return self._nearest(q0, owner, q, distance)
 
-    def descend(self, targets: TargetBatch) -> Array:
-        """Return the local minima (k, n) of the distance next to the starts of k targets."""
+    def descend(self, targets: TargetBatch, is_local: bool = True) -> Array:
+        """Return the local minima (k, n) to which the starts of k targets descend.
+
+        Args:
+            targets: k targets of the kinds of contacts of this search.
+            is_local: True for short steps, which end at a minimum near the start.
+        """
         q = targets.starts(self._trials.robot.description)
-        parameters = self._parameters(targets, DESCENT.local_step)
+        max_step = DESCENT.local_step if is_local else UNLIMITED_STEP
+        parameters = self._parameters(targets, max_step)
         return self._q(self._run(self._states(parameters, q), parameters))
 
     def _parameters(self, targets: TargetBatch, max_step: float) -> Array:
