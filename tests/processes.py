@@ -20,6 +20,7 @@ NOT_ROOT = pytest.mark.skipif(
 """Mark of tests of files that may not be read or written."""
 
 ROOT = Path(__file__).parents[1]
+MODELS = ROOT / "models"
 
 
 def python(*words: object, path: object = ROOT, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -18,6 +18,7 @@ import jsonschema
 import pytest
 import yaml
 from commands import COMMANDS, GROUPS, load, main, schema_of
+from processes import ROOT
 
 import casadi_ik as ik
 
@@ -25,7 +26,6 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 
 from building.speed import label, means
 
-ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^    (casadi-ik .*)$", re.MULTILINE)

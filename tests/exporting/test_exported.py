@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from c_flags import SANITIZERS, STRICT
 from commands import main
 from processes import output_of
 
@@ -21,9 +22,6 @@ from casadi_ik.export.project import EXPORT_MARKER, c_project, export_prefix, wr
 from casadi_ik.export.single import SINGLE_ROUNDING, SinglePrecision, in_single_precision
 from casadi_ik.export.solver import sanitized_name
 from casadi_ik.export.targets import SceneTargets, stored_targets
-
-STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
-SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 LIBM = {"sin", "cos", "sincos", "pow", "fmod", "fmax", "fmin", "rint", "sqrt", "floor", "hypot"}
 LIBM |= {"frexp", "ldexp"}

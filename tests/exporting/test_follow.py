@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from c_flags import SANITIZERS, STRICT
 from commands import main
 from excursions import excursion
 from moved_base import on_pedestal
@@ -18,8 +19,6 @@ import casadi_ik as ik
 
 pytestmark = pytest.mark.slow
 
-STRICT = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off")
-SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 PERIOD = 0.004
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")

@@ -13,14 +13,13 @@ import jsonschema
 import pytest
 import yaml
 from commands import main
+from processes import MODELS
 
 import casadi_ik as ik
 from casadi_ik.app.cli.lists import FILES, schema_of
 from casadi_ik.files.reading import validated
 from casadi_ik.model.load_robot import file_type
 
-ROOT = Path(__file__).parents[2]
-MODELS = ROOT / "models"
 FOLDERS = {
     "robot": "arm_hands",
     "arm": "arms",

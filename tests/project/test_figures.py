@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 import yaml
+from processes import ROOT
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 
 from building.speed import label, means
 
-ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "studies" / "results"
 PAGES = [
     ROOT / "README.md",

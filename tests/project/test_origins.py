@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 import tomllib
-from pathlib import Path
 
 import pytest
 import yaml
+from processes import ROOT
 from write_notice import notice
 
-ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "robots_origin.md").read_text()
 ROBOTS, LICENCES = (
     dict(re.findall(r"^\| (\S+) \| (.*) \|$", part, re.MULTILINE))

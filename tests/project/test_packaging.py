@@ -5,16 +5,14 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
-from pathlib import Path
 
 import pytest
 import yaml
-from processes import python
+from processes import ROOT, python
 
 import casadi_ik as ik
 from casadi_ik.errors import EXTRA_OF_MODULE
 
-ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ON_DEMAND = "pinocchio coal matplotlib pyvista polars mujoco scipy proxsuite trimesh collada rich"
 """What the public names do not import."""

@@ -16,12 +16,12 @@ import numpy_oracle
 import pytest
 import yaml
 from commands import main
+from processes import MODELS
 from toy_robots import grasp_at
 
 import casadi_ik as ik
 from casadi_ik import model as robots
 
-MODELS = Path(__file__).parents[2] / "models"
 ARMS, HANDS = ik.shipped_names("arms"), ik.shipped_names("hands")
 FEWER = {"panda_hand": 2, "robotiq_2f85": 2, "widowx_gripper": 2, "so100_jaw": 2, "tool": 1}
 UNMOVED = {"tool": ("tip",), "so100_jaw": ("fixed",)}

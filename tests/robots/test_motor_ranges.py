@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import casadi as ca
 import numpy as np
 import pytest
 import yaml
+from processes import MODELS
 from toy_robots import COUPLED_HAND, copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
 from casadi_ik.kinematics.couplings import follow
 from casadi_ik.model.couplings import FourBar, LeadScrew, Linear
-
-MODELS = Path(__file__).parents[2] / "models"
 
 NARROW = {
     "left_spread": [-0.1, 0.5],

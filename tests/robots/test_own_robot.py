@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from processes import MODELS, ROOT
 from toy_robots import copy_shipped_robot, replace, write_coupled_robot
 
 import casadi_ik as ik
-
-ROOT = Path(__file__).parents[2]
-MODELS = ROOT / "models"
 
 
 def test_copy_with_relative_paths_is_the_same_robot(own_robot, robot, rng, monkeypatch):

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from processes import MODELS
 
 import casadi_ik as ik
 from casadi_ik import model as robots
-
-MODELS = Path(__file__).parents[2] / "models"
 
 DEG = np.pi / 180
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
-STUDIES = Path(__file__).parents[2] / "studies"
+from processes import ROOT
+
+STUDIES = ROOT / "studies"
 
 
 def coverages(report: str) -> list[float]:

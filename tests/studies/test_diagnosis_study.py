@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
-from processes import python
+from processes import ROOT, python
 
 pytestmark = pytest.mark.usefixtures("usual_flags")
 
-STUDIES = Path(__file__).parents[2] / "studies"
+STUDIES = ROOT / "studies"
 
 
 def test_study_is_consistent_and_stored_report_has_no_false_alarm(tmp_path):

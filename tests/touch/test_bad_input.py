@@ -5,12 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from touch_cases import PLACE
 
 import casadi_ik as ik
 from casadi_ik import errors
 
-PLACE = np.eye(4)
-PLACE[:3, 3] = [0.5, 0.1, 0.055]
 BOX = trimesh.creation.box((0.05, 0.06, 0.1))
 
 

@@ -5,7 +5,6 @@ import numpy as np
 import casadi_ik as ik
 
 PLACE = np.eye(4)
-
 PLACE[:3, 3] = [0.5, 0.1, 0.055]
 
 
