@@ -71,6 +71,15 @@ mount: {xyz: [0.1, 0, 0.2], rpy: [0, 0, 90 deg]}
 home: {spread: 0.2}
 """
 
+EXACT = ik.Tolerance(1e-6, 1e-6)
+"""Tolerance of numerically exact solutions."""
+
+PAPER_METHODS = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
+"""Methods of Qiu and Kermani."""
+
+MULTI_ARM_ROBOTS = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
+"""Robots of several arm-hands, or of one on a trunk."""
+
 
 def write_coupled_robot(folder: Path) -> Path:
     """Write the coupled robot, its hand in a folder beside it; the path of the robot's file."""

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 from robot_variants import derived_robot
 from samplers import near_limits
-from toy_robots import grasp_at
+from toy_robots import EXACT, grasp_at
 
 import casadi_ik as ik
-
-EXACT = ik.Tolerance(1e-6, 1e-6)
 
 SINGLE = ("ur5e", "puma560", "irb140")
 

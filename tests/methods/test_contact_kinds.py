@@ -6,14 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_robots import near_home
+from toy_robots import PAPER_METHODS, near_home
 from trace_checks import TraceRecorder
 
 import casadi_ik as ik
 from casadi_ik import logs
 
 METHODS = ("hand-first", "thumb-first", "ipopt")
-PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
 SIDE, UP = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.0, 1.0])
 RADIUS = 9.5e-3
 """Of Barrett's pads [m]."""
@@ -175,7 +174,7 @@ def test_full_poses_of_all_fingers(robot, oracle, solvers, method):
         np.testing.assert_allclose(frame[:3, :3], goal[:3, :3], atol=2e-3)
 
 
-@pytest.mark.parametrize("method", PAPER)
+@pytest.mark.parametrize("method", PAPER_METHODS)
 def test_paper_methods_name_their_requirements(robot, method):
     points, normals, tangents = (frames(robot)[None, :, :3, i] for i in (3, 0, 1))
     solver = ik.Solver(robot, method, finger_step="closed-form", compiled=False)

@@ -9,12 +9,11 @@ import pickle
 import numpy as np
 import pytest
 from pinocchio_oracle import PinocchioRobot, assert_verdicts
-from toy_robots import grasp_of, near_home
+from toy_robots import MULTI_ARM_ROBOTS, PAPER_METHODS, grasp_of, near_home
 
 import casadi_ik as ik
 from casadi_ik.solve import registry
 
-PAPER = ("enhanced-dls", "enhanced-sdls", "original-dls", "original-sdls")
 ROBOTS = ik.shipped_names("arm_hands")
 SLOW = {("original-dls", "baxter_ar10"), ("original-sdls", "baxter_ar10")}
 """A hierarchy of ten contact tasks on 17 motors: minutes to compile, and never at the contacts."""
@@ -22,11 +21,9 @@ SLOW = {("original-dls", "baxter_ar10"), ("original-sdls", "baxter_ar10")}
 CHOOSING = ("hand-first", "thumb-first")
 """Methods that take the nearest of several solutions."""
 
-BODIES = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
-"""Several arm-hands, or one on a trunk: other methods refuse those with more than one palm."""
 
 CASES = [(m, r) for m in ik.METHODS for r in ROBOTS if (m, r) not in SLOW]
-CASES += [("hand-first", body) for body in BODIES]
+CASES += [("hand-first", body) for body in MULTI_ARM_ROBOTS]
 
 
 @dataclasses.dataclass
@@ -49,7 +46,7 @@ class Case:
 
     def fresh_solver(self, **options) -> ik.Solver:
         """A solver of its own."""
-        if self.method in PAPER:
+        if self.method in PAPER_METHODS:
             options = {"finger_step": "closed-form"} | options
         if self.method.startswith("original"):
             # They swing for thousands of iterations; what is promised shows in fewer.
@@ -176,7 +173,7 @@ def test_a_batch_is_its_single_solves(case):
     np.testing.assert_array_equal(batch.q[0], single.q)
     assert batch.status[0] == single.status
     assert batch.iterations[0] == single.iterations
-    if case.method in PAPER:  # no random numbers: any row is its own solve
+    if case.method in PAPER_METHODS:  # no random numbers: any row is its own solve
         whole_batch = solver.solve_batch(case.points, case.normals)
         for row in range(3):
             single_batch = solver.solve_batch(
@@ -232,7 +229,7 @@ def test_starts_row_by_row(case):
 
 def test_solved_start_is_returned(case):
     """But for the paper's methods, which stand as the paper has them: they begin by moving."""
-    if case.method in PAPER:
+    if case.method in PAPER_METHODS:
         pytest.skip("the paper's method reaches with the thumb first, wherever it is")
     batch = case.solver().solve_batch(case.points, case.normals, q0=case.q)
     np.testing.assert_array_equal(batch.q, case.q)

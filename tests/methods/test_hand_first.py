@@ -8,10 +8,9 @@ from robot_variants import derived_robot
 from samplers import (
     near_limits,
 )
+from toy_robots import EXACT
 
 import casadi_ik as ik
-
-EXACT = ik.Tolerance(1e-6, 1e-6)
 
 
 @pytest.fixture(scope="module")

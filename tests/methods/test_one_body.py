@@ -4,13 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_robots import grasp_at, grasp_of
+from toy_robots import MULTI_ARM_ROBOTS, grasp_at, grasp_of
 
 import casadi_ik as ik
 
 pytestmark = pytest.mark.slow
 
-BODIES = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_kuka_lwr_barrett")
 ONE_HAND = (
     r"is for one arm with one hand, found 'g1\+dex3', a multi-arm robot \(left, right\); "
     r"use robot\.side\('left'\)$"
@@ -18,7 +17,7 @@ ONE_HAND = (
 FINE = ik.Tolerance(position=1e-6, angle=1e-6)
 
 
-@pytest.fixture(scope="module", params=BODIES)
+@pytest.fixture(scope="module", params=MULTI_ARM_ROBOTS)
 def robot(request):
     return ik.load_robot(request.param)
 

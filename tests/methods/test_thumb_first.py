@@ -6,18 +6,20 @@ import numpy as np
 import pytest
 from robot_variants import thumb_of
 from samplers import shipped_hands
+from toy_robots import EXACT
 
 import casadi_ik as ik
 
-PAPER = ik.Tolerance()
-EXACT = ik.Tolerance(1e-6, 1e-6)
+DEFAULT_TOLERANCE = ik.Tolerance()
 
 
 STARTS = 32
 """Starts of a solve, unless it is told."""
 
 
-def thumb_first(robot, tolerance=PAPER, limits="enforce", compiled=True, **options) -> ik.Solver:
+def thumb_first(
+    robot, tolerance=DEFAULT_TOLERANCE, limits="enforce", compiled=True, **options
+) -> ik.Solver:
     return ik.Solver(
         robot, "thumb-first", tolerance, limits=limits, compiled=compiled, options=options
     )
@@ -52,9 +54,13 @@ def test_single_start_usually_suffices(robot, single_start, rng, hands):
 @pytest.mark.parametrize(
     ("hands", "tolerance", "min_solved"),
     [
-        *((hands, tolerance, 1) for hands in (shipped_hands, bent) for tolerance in (PAPER, EXACT)),
+        *(
+            (hands, tolerance, 1)
+            for hands in (shipped_hands, bent)
+            for tolerance in (DEFAULT_TOLERANCE, EXACT)
+        ),
         # Hands that are no grasps.
-        (ik.ArmHand.random, PAPER, 0.995),
+        (ik.ArmHand.random, DEFAULT_TOLERANCE, 0.995),
         (ik.ArmHand.random, EXACT, 0.98),
     ],
 )

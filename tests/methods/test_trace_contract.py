@@ -31,14 +31,14 @@ from casadi_ik import logs
 from casadi_ik.solve.trace import STANDARD_FIELDS, StandardField, trace_format
 
 REQUIRED = {field for field in STANDARD_FIELDS if field.required}
-PAPER = {"finger_step": "closed-form", "max_iterations": 400}
+PAPER_OPTIONS = {"finger_step": "closed-form", "max_iterations": 400}
 METHODS: Mapping[str, tuple[set[StandardField], dict[str, Any]]] = {
     "hand-first": ({COST, DAMPING, RESTART, ACCEPTED}, {}),
     "thumb-first": ({COST, DAMPING, ACTIVE_MASK, RESTART, ACCEPTED}, {"starts": 4}),
-    "enhanced-dls": (set(), PAPER),
-    "enhanced-sdls": (set(), PAPER),
-    "original-dls": (set(), PAPER),
-    "original-sdls": (set(), PAPER),
+    "enhanced-dls": (set(), PAPER_OPTIONS),
+    "enhanced-sdls": (set(), PAPER_OPTIONS),
+    "original-dls": (set(), PAPER_OPTIONS),
+    "original-sdls": (set(), PAPER_OPTIONS),
     "ipopt": ({COST, RESTART}, {"restarts": 2}),
 }
 """Of each method: which optional fields it records, and options that keep the runs short."""

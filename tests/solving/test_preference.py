@@ -7,12 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from toy_robots import grasp_at
+from toy_robots import EXACT, grasp_at
 
 import casadi_ik as ik
 from casadi_ik import errors
-
-EXACT = ik.Tolerance(1e-6, 1e-6)
 
 
 def distance(robot, q, q0):
