@@ -176,7 +176,7 @@ def _on_view(
     page_state, served, solves, begun = viewer.page, [], [], [0.0]
     submit, draw = page_state.work.submit, page_state.draw
 
-    def asked(key: str, change: Callable[[], None]) -> None:
+    def note_submission(key: str, change: Callable[[], None]) -> None:
         begun[0] = time.perf_counter()
         submit(key, change)
 
@@ -209,7 +209,7 @@ def _on_view(
     direction = max((tip - start for tip in tips), key=lambda tip: float(np.linalg.norm(tip)))
     quantities: Quantities = {}
     quantities["picture painted again ms"] = _still(page, STILL.replace("DRAW", ""))
-    page_state.work.submit, page_state.draw = asked, answered
+    page_state.work.submit, page_state.draw = note_submission, answered
     with _cpu_of(browser, steps, quantities, "server", "renderer", "GPU"):
         rows = _drag(page, start + 0.92 * direction, 0.25 * direction, steps, pause)
     viewer.stop()

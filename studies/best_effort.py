@@ -123,25 +123,25 @@ def targets_of(
         return points, frames[..., :3, 0], {}
     axes = rng.normal(size=(count, 3))
     axes *= (np.radians(rng.choice(TURNS, count)) / np.linalg.norm(axes, axis=1))[:, None]
-    turned = Rotation.from_rotvec(axes).as_matrix()[:, None] @ frames[..., :3, :3]
-    return points, turned[..., 0], {"tangents": turned[..., 1]}
+    rotated = Rotation.from_rotvec(axes).as_matrix()[:, None] @ frames[..., :3, :3]
+    return points, rotated[..., 0], {"tangents": rotated[..., 1]}
 
 
 def solve(part: Part) -> dict[str, Any]:
     """Solve a part, and its reference."""
     robot = ik.load_robot(part.robot)
     solver, rng = ik.Solver(robot), np.random.default_rng([part.seed, part.number])
-    points, normals, more = targets_of(robot, rng, part.size)
+    points, normals, tangents = targets_of(robot, rng, part.size)
     fixed = {robot.actuators[3]: float(robot.home[3])} if part.robot == FIVE_AXES else None
     options: dict[str, Any] = {"fixed": fixed, "best_effort": True}
     for limit in (2, 100):  # a first use compiles the kernels of single rows and of lanes
-        first: dict[str, Any] = {name: array[:limit] for name, array in more.items()}
+        first: dict[str, Any] = {name: array[:limit] for name, array in tangents.items()}
         solver.solve_batch(points[:limit], normals[:limit], **options, **first)
     begin = time.process_time()
-    batch = solver.solve_batch(points, normals, **options, **more)
+    batch = solver.solve_batch(points, normals, **options, **tangents)
     total = (time.process_time() - begin) / part.size
     rows = np.flatnonzero(batch.status == ik.Status.NEAREST)
-    vectors: dict[str, Any] = {name: array[rows] for name, array in more.items()}
+    vectors: dict[str, Any] = {name: array[rows] for name, array in tangents.items()}
     targets = solver._target_builder.from_arrays(points[rows], normals[rows], vectors, fixed=fixed)
     search: NearestSearch = solver._engine.engine_for(targets).nearest_search
     home, owner = np.tile(robot.home, (len(rows), 1)), np.arange(len(rows))

@@ -58,7 +58,7 @@ class Run:
 
     error: Array
     rough: float
-    own: float
+    path_roughness: float
     seconds: Array
     palm: float
 
@@ -275,7 +275,10 @@ def main(arguments: list[str] | None = None) -> None:
             row = [name, "yes" if wrist else "no", f"{np.median(error):.2f}"]
             row += [f"{np.quantile(error, 0.99):.1f}", f"{100 * np.mean(error < 5):.1f}"]
             row += [f"{1e3 * np.median([run.palm for run in runs]):.0f}"]
-            row += [f"{max(run.rough for run in runs):.2f}", f"{max(run.own for run in runs):.2f}"]
+            row += [
+                f"{max(run.rough for run in runs):.2f}",
+                f"{max(run.path_roughness for run in runs):.2f}",
+            ]
             row += [f"{np.median(seconds):.0f}", f"{np.quantile(seconds, 0.99):.0f}"]
             rows.append(row)
             Console().print(row)
