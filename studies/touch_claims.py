@@ -353,8 +353,8 @@ def link_depth(robot: ik.ArmHand, mesh: Any, back: np.ndarray, grasp: Any) -> fl
     for capsule in robot.description.shapes.capsules:
         if capsule.covers >= 0 or body(capsule.link) in touching:
             continue
-        count = 2 + int(2 * np.linalg.norm(capsule.half) / 4e-3)
-        axis_points = capsule.center + np.linspace(-1, 1, count)[:, None] * capsule.half
+        count = 2 + int(2 * np.linalg.norm(capsule.half_axis) / 4e-3)
+        axis_points = capsule.center + np.linspace(-1, 1, count)[:, None] * capsule.half_axis
         pose = back @ poses[capsule.link]
         axes.append(axis_points @ pose[:3, :3].T + pose[:3, 3])
         radii.append(np.full(count, capsule.radius))

@@ -183,7 +183,7 @@ def _distances(part: RobotPart, link: str, mesh: IndexedMesh) -> Array:
 def _ratio(part: RobotPart, link: str, mesh: IndexedMesh) -> float:
     """Return the volume of the shapes of a link relative to that of the hull of its mesh."""
     capsules, solids = _shapes(part, link)
-    reach = [np.abs(c.center) + np.abs(c.half) + c.radius for c in capsules]
+    reach = [np.abs(c.center) + np.abs(c.half_axis) + c.radius for c in capsules]
     reach += [np.abs(s.pose[:3, 3]) + np.linalg.norm(s.size) for s in solids]
     if not reach:
         return 0.0
@@ -200,9 +200,11 @@ def outside(points: Array, capsules: list[LinkCapsule], solids: list[LinkSolid])
     """Return the distances of points (k, 3) from the shapes of a link [m]; negative inside."""
     distances = np.full(len(points), np.inf)  # a link without shapes
     for capsule in capsules:
-        off, square = points - capsule.center, float(capsule.half @ capsule.half)
-        ratio = np.clip(off @ capsule.half / square, -1, 1) if square > 0 else np.zeros(len(off))
-        distance = np.linalg.norm(off - ratio[:, None] * capsule.half, axis=1) - capsule.radius
+        off, square = points - capsule.center, float(capsule.half_axis @ capsule.half_axis)
+        ratio = (
+            np.clip(off @ capsule.half_axis / square, -1, 1) if square > 0 else np.zeros(len(off))
+        )
+        distance = np.linalg.norm(off - ratio[:, None] * capsule.half_axis, axis=1) - capsule.radius
         distances = np.minimum(distances, distance)
     for solid in solids:
         distances = np.minimum(distances, _from_solid(points, solid))

@@ -14,14 +14,14 @@ from casadi_ik.collision.clearance_kernel import ClearanceKernel
 from casadi_ik.collision.distances import PairTable, from_solid, pose_row
 from casadi_ik.collision.model import CollisionModel, check_base, collision_model, pair_table
 from casadi_ik.collision.scene import Scene
-from casadi_ik.collision.solids import Solid, capsule
+from casadi_ik.collision.solids import PosedSolid, Solid, capsule
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.link_shapes import Touching
 from casadi_ik.model.targets import TargetBatch
 
-ROUNDING = 1e-9
+DISTANCE_ROUNDING = 1e-9
 """Rounding error by which a distance may fall below the margin [m]."""
 
 Pair = tuple[str, str]
@@ -81,8 +81,8 @@ class CollisionQuery:
 
     def split_by_links(self, links: frozenset[str]) -> tuple[CollisionQuery, CollisionQuery]:
         """Return the queries with the pairs that involve one of the links, and with all others."""
-        within, others = self.table.split_by_links(links)
-        return self.with_table(within), self.with_table(others)
+        involved, uninvolved = self.table.split_by_links(links)
+        return self.with_table(involved), self.with_table(uninvolved)
 
     @property
     def hand_pairs(self) -> CollisionQuery:
@@ -100,12 +100,12 @@ class CollisionQuery:
         margins = np.append(self.table.margins, self.margin)[pairs]
         is_invalid = ~np.isfinite(q).all(axis=1)
         surplus = np.where(is_invalid, np.nan, surplus - self.margin)
-        free = surplus >= -ROUNDING
+        free = surplus >= -DISTANCE_ROUNDING
         return Clearances(surplus + margins, free, pairs, self.table.names, surplus)
 
     def free(self, q: Array) -> NDArray[np.bool_]:
         """Return whether configurations (k, n) are collision-free, (k,); faster than `check`."""
-        threshold = self.margin - ROUNDING
+        threshold = self.margin - DISTANCE_ROUNDING
         distances, _ = self.kernel.min_distances(q, self.poses, self.table, self.margin, threshold)
         return (distances >= threshold) & np.isfinite(q).all(axis=1)
 
@@ -137,30 +137,30 @@ class SceneCheck:
         self.model = self._allow_overlaps_at_home(collision_model(robot.description))
         self._grasping_scenes: dict[str, Scene] = {}
         self._pair_tables: dict[tuple[str, frozenset[str], bool], PairTable] = {}
-        (placed,) = self.kernel.shape_poses(robot.home)
-        check_base(self.model, scene, placed, scene.items)
+        (shape_poses,) = self.kernel.shape_poses(robot.home)
+        check_base(self.model, scene, shape_poses, scene.items)
         self.table(scene, frozenset())
 
     def moved(self, name: str, pose: Array) -> SceneCheck:
         """Return this check with an obstacle at another (4, 4) pose; the pairs stay the same.
 
         Raises:
-            UnknownNameError: There is no such obstacle.
+            UnknownNameError: The scene has no obstacle of this name.
             InputError: The pose is not rigid.
-            DescriptionError: The obstacle penetrates the robot's base there.
+            DescriptionError: The obstacle penetrates the robot's base.
         """
-        other = copy(self)
-        other.scene = self.scene.moved(name, pose)
-        (placed,) = self.kernel.shape_poses(self.robot.home)
-        check_base(self.model, other.scene, placed, {name})
-        other._grasping_scenes = {}
-        return other
+        check = copy(self)
+        check.scene = self.scene.moved(name, pose)
+        (shape_poses,) = self.kernel.shape_poses(self.robot.home)
+        check_base(self.model, check.scene, shape_poses, {name})
+        check._grasping_scenes = {}
+        return check
 
     def _allow_overlaps_at_home(self, model: CollisionModel, samples: int = 256) -> CollisionModel:
         """Exclude pairs that always overlap, and allow the overlaps at home.
 
-        Shapes enclose their links, so that the shapes of adjacent fingers may overlap although the
-        fingers do not touch. Pairs that overlap at home may overlap by 0.5 mm more.
+        Shapes enclose their links. Therefore the shapes of adjacent fingers may overlap although
+        the fingers do not touch. Pairs that overlap at home may overlap by 0.5 mm more.
         """
         table = pair_table(model, Scene(), ())
         random = self.robot.random(np.random.default_rng(0), samples)
@@ -168,27 +168,26 @@ class SceneCheck:
         distances = self.kernel.all_distances(q, np.zeros((0, 12)), table)
         distances_of: dict[Pair, Array] = {}
         for i, names in enumerate(table.names):
-            known = distances_of.get(names)
-            column = distances[:, i]
-            distances_of[names] = column if known is None else np.minimum(known, column)
-        reason = f"their shapes touch in all of {samples} random configurations, seed 0"
+            minimum = distances_of.get(names, np.inf)
+            distances_of[names] = np.minimum(minimum, distances[:, i])
+        reason = f"the shapes touch in all of {samples} random configurations, seed 0"
         always = [Touching(names, reason) for names, d in distances_of.items() if (d < 0).all()]
-        reason = "their shapes overlap at home, where the robot is taken to be free"
+        reason = "the shapes overlap at home, where the robot is assumed to be collision-free"
         depths = {frozenset(entry.links): entry.depth for entry in model.allowed}
         at_home = [
             Touching(names, reason, 0.5e-3 - float(d[0]) + depths.get(frozenset(names), 0.0))
             for names, d in distances_of.items()
             if d[0] < 0
         ]
-        reduced = model.without(always)
+        reduced = model.with_excluded(always)
         return replace(reduced, allowed=reduced.allowed + tuple(at_home))
 
     @cached_property
     def finger_bodies(self) -> dict[str, frozenset[str]]:
-        """Links that may touch the grasped object, by finger: those fixed to the link of its pad.
+        """Links that may touch the grasped object, by finger: links fixed to the link of its pad.
 
-        For a finger without joints, such as the fixed jaw of a gripper, this is its own link alone,
-        since the palm and the end of the arm are fixed to it.
+        A finger without joints, such as the fixed jaw of a gripper, has only the link of its pad,
+        because palm and arm are fixed to it.
         """
         bodies = self.model.bodies
         return {
@@ -198,15 +197,15 @@ class SceneCheck:
             for finger in self.robot.description.fingers
         }
 
-    def collision_query(self, targets: TargetBatch, carried: bool = False) -> CollisionQuery:
+    def collision_query(self, targets: TargetBatch, is_carried: bool = False) -> CollisionQuery:
         """Return the collision query of targets.
 
         Args:
             targets: The targets.
-            carried: True if the hand carries the grasped object.
+            is_carried: True if the hand carries the grasped object.
 
         Raises:
-            UnknownNameError: The scene has no such object.
+            UnknownNameError: Neither an obstacle nor a shipped object has the object's name.
         """
         scene, name = self.scene, targets.object or self.scene.grasped
         pose = targets.object_pose
@@ -217,9 +216,8 @@ class SceneCheck:
         has_contact = np.atleast_1d(~np.isnan(targets.points[..., 0]).all(axis=0))
         fingers = zip(self.robot.fingers, has_contact, strict=True)
         bodies = (self.finger_bodies[finger] for finger, touches in fingers if touches)
-        touched = frozenset().union(*bodies)
-        table, moved = self.table(scene, touched, carried), name if pose is not None else None
-        poses = table.poses(scene.items, moved, pose)
+        table = self.table(scene, frozenset().union(*bodies), is_carried)
+        poses = table.poses(scene.items, name if pose is not None else None, pose)
         return CollisionQuery(self.kernel, table, poses, scene.margin)
 
     def _grasping(self, name: str, pose: Array) -> Scene:
@@ -228,17 +226,21 @@ class SceneCheck:
             self._grasping_scenes[name] = self.scene.holding(name, pose)
         return self._grasping_scenes[name]
 
-    def table(self, scene: Scene, touched: frozenset[str], carried: bool = False) -> PairTable:
+    def table(
+        self, scene: Scene, touching_links: frozenset[str], is_carried: bool = False
+    ) -> PairTable:
         """Return the pairs of this scene, possibly with another grasped object.
 
         Args:
             scene: The scene.
-            touched: Links that may touch the grasped object.
-            carried: True if the hand carries the object.
+            touching_links: Links that may touch the grasped object.
+            is_carried: True if the hand carries the object.
         """
-        key = scene.grasped or "", touched, carried
+        key = scene.grasped or "", touching_links, is_carried
         if key not in self._pair_tables:
-            self._pair_tables[key] = pair_table(self.model, scene, sorted(touched), carried)
+            self._pair_tables[key] = pair_table(
+                self.model, scene, sorted(touching_links), is_carried
+            )
         return self._pair_tables[key]
 
 
@@ -247,15 +249,15 @@ class ClosestPoints:
     """The closest points of a pair.
 
     Attributes:
-        ends: (2, 3) closest points of the first and of the second shape, base frame [m]; for
+        points: (2, 3) closest points of the first and of the second shape, base frame [m]; for
             overlapping shapes, the points of deepest penetration.
         distance: Distance [m]; negative: penetration.
         shapes: The two shapes, each with its (4, 4) pose in the base frame.
     """
 
-    ends: Array
+    points: Array
     distance: float
-    shapes: tuple[tuple[Solid, Array], tuple[Solid, Array]]
+    shapes: tuple[PosedSolid, PosedSolid]
 
 
 def closest_points(
@@ -273,13 +275,13 @@ def closest_points(
         None if one of them has no shape.
     """
     best: ClosestPoints | None = None
-    others = link_capsules(robot, q, pair[1]) or [
+    second_shapes = link_capsules(robot, q, pair[1]) or [
         (solid, pose) for name, solid, pose in scene_solids(scene) if name == pair[1]
     ]
     for link_capsule, capsule_pose in link_capsules(robot, q, pair[0]):
         radius, half_length = link_capsule.size[:2]
         segment = np.append(capsule_pose[:3, 3], half_length * capsule_pose[:3, 2])
-        for solid, solid_pose in others:
+        for solid, solid_pose in second_shapes:
             distances, positions = from_solid(
                 solid, segment[None, None], pose_row(solid_pose)[None]
             )
@@ -288,9 +290,9 @@ def closest_points(
                 point = segment[:3] + position * segment[3:]
                 direction = _outward(solid, solid_pose, point)
                 surface_point = point - radius * direction
-                ends = np.stack([surface_point, surface_point - distance * direction])
+                points = np.stack([surface_point, surface_point - distance * direction])
                 shapes = (link_capsule, capsule_pose), (solid, solid_pose)
-                best = ClosestPoints(ends, distance, shapes)
+                best = ClosestPoints(points, distance, shapes)
     return best
 
 
@@ -304,21 +306,21 @@ def _outward(solid: Solid, pose: Array, point: Array) -> Array:
 
 
 def scene_solids(scene: Scene) -> Iterator[tuple[str, Solid, Array]]:
-    """Yield every solid of a scene: name of its item, solid, (4, 4) pose in the base frame."""
-    for name, item in scene.items.items():
-        for solid, place in item.parts:
-            yield name, solid, item.pose @ place
+    """Yield every solid of a scene: name of its obstacle, solid, (4, 4) pose in the base frame."""
+    for name, obstacle in scene.items.items():
+        for solid, pose in obstacle.parts:
+            yield name, solid, obstacle.pose @ pose
 
 
-def link_capsules(robot: ArmHand, q: Array, link: str) -> list[tuple[Solid, Array]]:
+def link_capsules(robot: ArmHand, q: Array, link: str) -> list[PosedSolid]:
     """Return the capsules of a link, each along z of its (4, 4) pose in the base frame."""
     capsules = []
     for shape in robot.description.shapes.capsules:
         if shape.link == link:
-            half_length = float(np.linalg.norm(shape.half))
+            half_length = float(np.linalg.norm(shape.half_axis))
             placement = np.eye(4)
             if half_length > 0:
-                z = shape.half / half_length
+                z = shape.half_axis / half_length
                 x = np.cross(z, np.eye(3)[np.abs(z).argmin()])
                 x /= np.linalg.norm(x)
                 placement[:3, :3] = np.column_stack([x, np.cross(z, x), z])

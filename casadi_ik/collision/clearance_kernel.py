@@ -23,7 +23,8 @@ from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.description import RobotDescription
 
-SYMBOL = "casadi_ik_clearance"
+CLEARANCE_SYMBOL = "casadi_ik_clearance"
+"""Name of the compiled function."""
 
 RECENT = 8
 """Number of recently critical pairs, which the driver checks first."""
@@ -57,7 +58,7 @@ class Guarding:
         last_step: (n,) last step of the motors.
         wanted_step: (n,) next step without obstacles.
         share: (n,) share of that step that is free, by motor; 0 if the motor brakes.
-        step: (n,) step after which the motors can come to rest free.
+        step: (n,) step from which the motors can stop without collision.
         q_rest: (n,) positions at rest after that step.
     """
 
@@ -193,14 +194,14 @@ class ClearanceKernel:
             f"{self.name}_lanes{lanes}",
             lambda: self._graph.function,
             define(constants) + "".join(map(driver_text, names)),
-            SYMBOL,
+            CLEARANCE_SYMBOL,
             self._graph.recipe,
             lanes,
         )
         if library is None:
             return None
         self.guards = library["casadi_ik_keep_away"], library["casadi_ik_stop_in_time"]
-        return library[SYMBOL]
+        return library[CLEARANCE_SYMBOL]
 
     @cached_property
     def shape_poses(self) -> FunctionKernel:
@@ -253,12 +254,12 @@ class ClearanceKernel:
         """
         solids, planes = table.driver_arrays
         solid_poses = doubles(poses)
-        radii, halves, offsets = map(doubles, (table.radii, table.halves, table.offsets))
+        radii, halves, offsets = map(doubles, (table.radii, table.half_lengths, table.offsets))
         job = ClearanceJob(
             q=memory(q),
             poses=solid_poses.ctypes.data,
             pose_step=solid_poses[0].size if solid_poses.ndim == 3 else 0,
-            n_solids=len(solids) - table.own,
+            n_solids=len(solids) - table.n_robot_solids,
             solids=solids.ctypes.data,
             planes=planes.ctypes.data,
             radii=memory(radii),

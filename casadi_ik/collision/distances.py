@@ -28,25 +28,25 @@ class PairTable:
 
     Attributes:
         radii: (s,) radii of the robot's capsules [m].
-        halves: (s,) half lengths of their segments [m].
+        half_lengths: (s,) half lengths of the segments of the capsules [m].
         pairs: (p, 2) index of a capsule; index of a second one, or s + index of a solid.
-        own: Number of solids of the robot, which come first.
+        n_robot_solids: Number of solids of the robot, which precede those of the scene.
         offsets: (p,) distance that each pair must keep in addition to the scene's margin [m].
         solids: The solids.
-        places: Pose (4, 4) of each solid of the scene, in the frame of its item.
-        items: Name of the item of each solid of the scene.
-        names: (p, 2) names of each pair: links, or a link and an item.
-        moving: Links that an arm may move while its palm stays in place.
+        placements: (4, 4) pose of each solid of the scene, in the frame of its obstacle.
+        items: Name of the obstacle of each solid of the scene.
+        names: (p, 2) names of each pair: links, or a link and an obstacle.
+        moving: Links that an arm may move while its palm is fixed.
         margins: (p,) margin of each pair, beyond the overlap that it is allowed [m].
     """
 
     radii: Array
-    halves: Array
+    half_lengths: Array
     pairs: NDArray[np.int32]
     offsets: Array
-    own: int
+    n_robot_solids: int
     solids: tuple[Solid, ...]
-    places: tuple[Array, ...]
+    placements: tuple[Array, ...]
     items: tuple[str, ...]
     names: tuple[tuple[str, str], ...]
     moving: frozenset[str] = frozenset()
@@ -56,21 +56,27 @@ class PairTable:
     )
 
     def poses(
-        self, items: dict[str, Obstacle], moved: str | None = None, to: Array | None = None
+        self,
+        items: dict[str, Obstacle],
+        varied_item: str | None = None,
+        varied_poses: Array | None = None,
     ) -> Array:
         """Return the poses of the scene's solids as rows of rotation (row-major) and origin.
 
         Args:
-            items: Items of the scene by name.
-            moved: Name of an item with another pose in each row.
-            to: (k, 4, 4) poses of that item.
+            items: Obstacles of the scene by name.
+            varied_item: Name of an obstacle with another pose in each row.
+            varied_poses: (k, 4, 4) poses of that obstacle.
 
         Returns:
-            (n, 12), or (k, n, 12) with a moved item.
+            (n, 12), or (k, n, 12) with varied poses.
         """
+        item_poses = {name: obstacle.pose for name, obstacle in items.items()}
+        if varied_item is not None and varied_poses is not None:
+            item_poses[varied_item] = varied_poses
         rows = [
-            pose_row((to if name == moved and to is not None else items[name].pose) @ place)
-            for place, name in zip(self.places, self.items, strict=True)
+            pose_row(item_poses[name] @ placement)
+            for placement, name in zip(self.placements, self.items, strict=True)
         ]
         return np.stack(np.broadcast_arrays(*rows), axis=-2) if rows else np.zeros((0, 12))
 
@@ -119,7 +125,7 @@ class PairTable:
     @property
     def is_self_pair(self) -> NDArray[np.bool_]:
         """True for the pairs of the robot with itself, (p,)."""
-        return self.pairs[:, 1] < len(self.radii) + self.own
+        return self.pairs[:, 1] < len(self.radii) + self.n_robot_solids
 
     def select(self, rows: NDArray[np.bool_]) -> PairTable:
         """Return the table with a selection (p,) of its pairs."""
@@ -144,7 +150,7 @@ def pair_distances(shapes: Array, poses: Array, table: PairTable) -> tuple[Array
     """Compute the distances of all pairs of a table.
 
     Args:
-        shapes: (k, ...) poses of the robot's shapes, as `collision.model.shape_poses` returns them.
+        shapes: (k, ...) poses of the robot's shapes, from `collision.model.shape_poses`.
         poses: (k, n, 12) or (n, 12) poses of the scene's solids.
         table: The pairs.
 
@@ -154,8 +160,10 @@ def pair_distances(shapes: Array, poses: Array, table: PairTable) -> tuple[Array
     """
     k, p, s = len(shapes), len(table.pairs), len(table.radii)
     segments = shapes[:, : 6 * s].reshape(k, s, 6)
-    own = shapes[:, 6 * s : 6 * s + 12 * table.own].reshape(k, table.own, 12)
-    solid_poses = np.concatenate([own, np.broadcast_to(poses, (k, *poses.shape[-2:]))], axis=1)
+    m = table.n_robot_solids
+    robot_solid_poses = shapes[:, 6 * s : 6 * s + 12 * m].reshape(k, m, 12)
+    scene_solid_poses = np.broadcast_to(poses, (k, *poses.shape[-2:]))
+    solid_poses = np.concatenate([robot_solid_poses, scene_solid_poses], axis=1)
     first, second = table.pairs[:, 0], table.pairs[:, 1]
     distance, position = np.empty((k, p)), np.empty((k, p))
     capsules = np.flatnonzero(second < s)
@@ -230,40 +238,45 @@ def _min_convex(distance: Callable[[Array], Array], slope: Array) -> tuple[Array
     golden = (np.sqrt(5) - 1) / 2
     low, high = np.full(slope.shape, -1.0), np.ones(slope.shape)
     inner = low + (1 - golden) * 2, low + golden * 2
-    left, right = map(distance, inner)
+    lower_value, upper_value = map(distance, inner)
     for _ in range(46):
-        falls = left > right
+        falls = lower_value > upper_value
         low, high = np.where(falls, inner[0], low), np.where(falls, high, inner[1])
         width = high - low
         new = np.where(falls, low + golden * width, high - golden * width)
         value = distance(new)
         inner = np.where(falls, inner[1], new), np.where(falls, new, inner[0])
-        left, right = np.where(falls, right, value), np.where(falls, value, left)
+        lower_value, upper_value = (
+            np.where(falls, upper_value, value),
+            np.where(falls, value, lower_value),
+        )
     middle = (low + high) / 2
     return distance(middle) - slope * (high - low), middle
 
 
-def gaps(item: Obstacle, others: Sequence[Obstacle], poses: Array) -> Array:
-    """Compute the distances (k,) [m] of an item at poses (k, 4, 4) from others.
+def gaps(item: Obstacle, obstacles: Sequence[Obstacle], poses: Array) -> Array:
+    """Compute the distances (k,) [m] of an object at poses (k, 4, 4) from obstacles.
 
-    Points of either surface are checked against the other shape, which is accurate to a few
+    Surface points of each solid are checked against the other solid, which is accurate to a few
     millimetres. A negative distance means overlap.
 
     Args:
-        item: The item that moves.
-        others: The items that it may approach.
-        poses: (k, 4, 4) poses of the item, base frame.
+        item: The object.
+        obstacles: Obstacles at fixed poses.
+        poses: (k, 4, 4) poses of the object in the base frame.
     """
     distances = np.full(len(poses), np.inf)
-    fixed = [(solid, other.pose @ place) for other in others for solid, place in other.parts]
-    for (solid, part), (other, place) in product(item.parts, fixed):
-        points = surface_points(solid)[: 0 if other.kind is Kind.CLOUD else None]
-        other_points = surface_points(other)
-        for row, pose in enumerate(poses @ part):
-            relative = np.linalg.inv(place) @ pose
-            forward = _min_point_distance(points, relative, other) - _ball_radius(solid)
-            backward = _min_point_distance(other_points, np.linalg.inv(relative), solid)
-            backward -= _ball_radius(other)
+    fixed_parts = [
+        (solid, obstacle.pose @ pose) for obstacle in obstacles for solid, pose in obstacle.parts
+    ]
+    for (solid, placement), (fixed_solid, fixed_pose) in product(item.parts, fixed_parts):
+        points = surface_points(solid)[: 0 if fixed_solid.kind is Kind.CLOUD else None]
+        fixed_points = surface_points(fixed_solid)
+        for row, pose in enumerate(poses @ placement):
+            relative = np.linalg.inv(fixed_pose) @ pose
+            forward = _min_point_distance(points, relative, fixed_solid) - _ball_radius(solid)
+            backward = _min_point_distance(fixed_points, np.linalg.inv(relative), solid)
+            backward -= _ball_radius(fixed_solid)
             distances[row] = min(distances[row], forward, backward)
     return distances
 
@@ -284,8 +297,8 @@ def _min_point_distance(points: Array, pose: Array, solid: Solid) -> float:
 def surface_points(solid: Solid, rays: int = 256, steps: int = 12) -> Array:
     """Return points (k, 3) on the surface of a solid in its frame, also along its edges.
 
-    There are none for a half-space and for a solid that does not contain its origin; for a cloud
-    they are its points.
+    A half-space and a solid that does not contain its origin have no points. The points of a cloud
+    are returned unchanged.
 
     Args:
         solid: The solid.
@@ -336,30 +349,30 @@ def levers(robot: RobotDescription, table: PairTable) -> Array:
     """
     shapes = robot.shapes
     lever_arms = [
-        _lever_arms(robot, capsule.link, _segment_ends(capsule.center, capsule.half), 0.0)
+        _lever_arms(robot, capsule.link, _segment_ends(capsule.center, capsule.half_axis), 0.0)
         for capsule in shapes.capsules
     ]
     for shape, solid in zip(shapes.solids, table.solids, strict=False):
         lever_arms.append(_lever_arms(robot, shape.link, shape.pose[None, :3, 3], solid.reach))
-    # Solids of the scene are moved by no motor.
-    lever_arms += [np.zeros(len(robot.movable))] * (len(table.solids) - table.own)
+    # Motors do not move the solids of the scene.
+    lever_arms += [np.zeros(len(robot.movable))] * (len(table.solids) - table.n_robot_solids)
     first, second = np.array(lever_arms)[table.pairs.T]
     moves_both = (first > 0) & (second > 0)
     return np.where(moves_both, 0.0, first + second) @ _max_joint_rates(robot)
 
 
-def _segment_ends(center: Array, half: Array) -> Array:
-    return np.stack([center - half, center + half])
+def _segment_ends(center: Array, half_axis: Array) -> Array:
+    return np.stack([center - half_axis, center + half_axis])
 
 
 def _lever_arms(robot: RobotDescription, link: str, points: Array, radius: float) -> Array:
     """Return the largest distances of points of a link from the joints that carry it.
 
     Args:
-        robot: The description.
-        link: The link.
-        points: (k, 3) points in its frame.
-        radius: Radius of the balls around them [m].
+        robot: Description of the robot.
+        link: Name of the link.
+        points: (k, 3) points in the frame of the link.
+        radius: Radius of the balls around the points [m].
 
     Returns:
         (m,) distances from the axes of the movable joints [m]; 1 for a prismatic joint; 0 only for
@@ -382,9 +395,9 @@ def _lever_arms(robot: RobotDescription, link: str, points: Array, radius: float
 def _lever_arm(joint: Joint, points: Array, radius: float) -> float:
     if joint.type == "prismatic":
         return 1.0
-    along = points @ joint.axis
-    from_axis = np.sqrt(np.maximum((points * points).sum(axis=1) - along * along, 0.0))
-    return max(float(from_axis.max()) + radius, np.finfo(float).tiny)
+    axial = points @ joint.axis
+    radial = np.sqrt(np.maximum((points * points).sum(axis=1) - axial * axial, 0.0))
+    return max(float(radial.max()) + radius, np.finfo(float).tiny)
 
 
 def _max_joint_rates(robot: RobotDescription) -> Array:

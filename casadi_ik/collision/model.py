@@ -27,13 +27,13 @@ class CollisionModel:
     """The capsules of a robot and their collision pairs.
 
     Attributes:
-        robot: The description.
-        capsules: The capsules.
-        bodies: For each link the movable link that it is fixed to, or the root.
+        robot: Description of the robot.
+        capsules: Capsules of the links.
+        bodies: Movable link, or the root, that each link is fixed to.
         pairs: (p, 2) pairs to check: index of a capsule; index of a second one, or number of
             capsules + index of a solid of the robot.
-        excluded: Links that are not checked, and why.
-        allowed: Links that may overlap by a given depth, and why.
+        excluded: Links that are not checked, with the reason.
+        allowed: Links that may overlap by a given depth, with the reason.
     """
 
     robot: RobotDescription
@@ -49,9 +49,9 @@ class CollisionModel:
         return np.array([capsule.radius for capsule in self.capsules])
 
     @property
-    def halves(self) -> Array:
-        """Half lengths of the capsules' segments [m], (s,)."""
-        return np.array([float(np.linalg.norm(capsule.half)) for capsule in self.capsules])
+    def half_lengths(self) -> Array:
+        """Half lengths of the segments of the capsules [m], (s,)."""
+        return np.array([float(np.linalg.norm(capsule.half_axis)) for capsule in self.capsules])
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -68,17 +68,17 @@ class CollisionModel:
 
     @property
     def moving(self) -> frozenset[str]:
-        """Links between the base and the palm, which the arm may move while the palm stays."""
+        """Links between the base and the palm, which the arm may move while the palm is fixed."""
         palm = self.bodies[self.robot.palm_link]
-        carried = {self.robot.root} if palm == self.bodies[self.robot.root] else set[str]()
+        hand_links = {self.robot.root} if palm == self.bodies[self.robot.root] else set[str]()
         for joint in self.robot.joints:
-            if joint.parent in carried or self.bodies[joint.child] == palm:
-                carried.add(joint.child)
+            if joint.parent in hand_links or self.bodies[joint.child] == palm:
+                hand_links.add(joint.child)
         return frozenset(
-            link for link in self.bodies if link not in carried and not self.is_fixed(link)
+            link for link in self.bodies if link not in hand_links and not self.is_fixed(link)
         )
 
-    def without(self, touching: Iterable[Touching]) -> CollisionModel:
+    def with_excluded(self, touching: Iterable[Touching]) -> CollisionModel:
         """Return the model with further links that may touch."""
         added = tuple(touching)
         names = {frozenset(entry.links) for entry in added}
@@ -102,7 +102,7 @@ class CollisionModel:
 def collision_model(robot: RobotDescription) -> CollisionModel:
     """Return the collision model of a robot.
 
-    Pairs of one body, of neighbouring bodies and of links that may touch are not checked.
+    Pairs of links on the same body, on adjacent bodies, or that may touch are not checked.
 
     Raises:
         UnsupportedError: The arm or the hand has no shapes.
@@ -113,7 +113,7 @@ def collision_model(robot: RobotDescription) -> CollisionModel:
     for name in sorted({joint.part for joint in robot.movable}):
         if name not in described:
             raise UnsupportedError(
-                f"robot {robot.name!r}: its {name} has no shapes, which a scene needs; write "
+                f"robot {robot.name!r}: {name} has no shapes, which a scene requires; write "
                 "'collision:' in its description (docs/collision.md)"
             )
     bodies, neighbours = rigid_bodies(robot)
@@ -126,7 +126,7 @@ def collision_model(robot: RobotDescription) -> CollisionModel:
         if bodies[first] == bodies[second]:
             return False
         if names not in excluded and frozenset((bodies[first], bodies[second])) in neighbours:
-            excluded[names] = Touching((first, second), "a joint holds them together")
+            excluded[names] = Touching((first, second), "a joint connects the links")
         return names not in excluded
 
     checked_pairs = [
@@ -142,8 +142,8 @@ def collision_model(robot: RobotDescription) -> CollisionModel:
 def _pairs(shapes: Shapes) -> Iterator[tuple[int, int]]:
     """Yield all pairs of shapes.
 
-    These are pairs of capsules, and of a capsule and a solid. Of two solids one is represented by
-    the capsules that cover it.
+    A pair consists of two capsules, or of a capsule and a solid. In a pair of two solids, the
+    capsules that cover one of them represent it.
     """
     count = len(shapes.capsules)
     plain = [i for i, capsule in enumerate(shapes.capsules) if capsule.covers < 0]
@@ -157,7 +157,7 @@ def _pairs(shapes: Shapes) -> Iterator[tuple[int, int]]:
 
 
 def _link(shapes: Shapes, number: int) -> str:
-    """Return the link of a shape; capsules are numbered before solids."""
+    """Return the link of a shape by its index; capsules precede solids."""
     count = len(shapes.capsules)
     return shapes.capsules[number].link if number < count else shapes.solids[number - count].link
 
@@ -165,8 +165,8 @@ def _link(shapes: Shapes, number: int) -> str:
 def shape_poses(robot: RobotDescription, q: ca.SX) -> ca.SX:
     """Return the poses of the shapes in the base frame [m] as a column.
 
-    There are six numbers for each capsule, center and half-axis of its segment; then twelve for
-    each solid, rotation (row-major) and origin.
+    Each capsule has six numbers, center and half-axis of its segment; each solid has twelve,
+    rotation (row-major) and origin. Capsules precede solids.
     """
     links = actuated(robot, q).kinematics.links
     fixed_joints = {joint.child: joint for joint in robot.joints if joint.type == "fixed"}
@@ -182,7 +182,10 @@ def shape_poses(robot: RobotDescription, q: ca.SX) -> ca.SX:
     for capsule in robot.shapes.capsules:
         pose, placement = movable_link(capsule.link)
         center = placement[:3, :3] @ capsule.center + placement[:3, 3]
-        rows += [pose.origin + pose.rotate(center), pose.rotate(placement[:3, :3] @ capsule.half)]
+        rows += [
+            pose.origin + pose.rotate(center),
+            pose.rotate(placement[:3, :3] @ capsule.half_axis),
+        ]
     for solid in robot.shapes.solids:
         pose, placement = movable_link(solid.link)
         solid_pose = pose.at(placement @ solid.pose)
@@ -195,7 +198,7 @@ def shape_pose_size(robot: RobotDescription) -> int:
     return 6 * len(robot.shapes.capsules) + 12 * len(robot.shapes.solids)
 
 
-def own_solids(robot: RobotDescription) -> tuple[Solid, ...]:
+def robot_solids(robot: RobotDescription) -> tuple[Solid, ...]:
     """Return the boxes and cylinders of a robot."""
     solids = []
     for shape in robot.shapes.solids:
@@ -205,34 +208,33 @@ def own_solids(robot: RobotDescription) -> tuple[Solid, ...]:
 
 
 def pair_table(
-    model: CollisionModel, scene: Scene, touched_by: Sequence[str], carried: bool = False
+    model: CollisionModel, scene: Scene, touching_links: Sequence[str], is_carried: bool = False
 ) -> PairTable:
     """Return the collision pairs of a robot and a scene.
 
     Args:
         model: Collision model of the robot.
         scene: The scene.
-        touched_by: Links that may touch the grasped object.
-        carried: True if the grasped object moves with the hand, so that it is checked against
-            fixed links as well.
+        touching_links: Links that may touch the grasped object.
+        is_carried: True if the grasped object moves with the hand; it is then also checked against
+            fixed links.
 
     Raises:
-        DescriptionError: The scene names an unknown link or solid, or a solid penetrates the
-            robot's base.
+        DescriptionError: The scene names an unknown link or obstacle.
     """
-    links, known = model.links, set(model.robot.links) | set(scene.items)
+    links, valid_names = model.links, set(model.robot.links) | set(scene.items)
     may_touch = {frozenset(entry.links) for entry in scene.touching}
     entries = [("touching", i, entry.links) for i, entry in enumerate(scene.touching)]
     entries += [("margins", i, tuple(pair)) for i, pair in enumerate(scene.margins)]
     for key, i, pair in entries:
-        for name in sorted(set(pair) - known):
+        for name in sorted(set(pair) - valid_names):
             raise DescriptionError(
-                f"{scene.name}: {key}[{i}].links: unknown {name!r}; known: "
+                f"{scene.name}: {key}[{i}].links: {name!r} is unknown; expected one of: "
                 + ", ".join([*scene.items, *model.robot.links])
             )
-    own, count = own_solids(model.robot), len(model.capsules)
+    solids, count = robot_solids(model.robot), len(model.capsules)
     fingers = _finger_links(model.robot) if scene.enveloping else frozenset[str]()
-    parts = [(item, *part) for item in scene.items.values() for part in item.parts]
+    parts = [(obstacle, *part) for obstacle in scene.items.values() for part in obstacle.parts]
     rows: list[tuple[tuple[int, int], float, float, tuple[str, str]]] = []
 
     def add(pair: tuple[int, int], names: tuple[str, str], margin: float, offset: float) -> None:
@@ -240,27 +242,27 @@ def pair_table(
             margin = scene.margins.get(frozenset(names), margin)
             rows.append((pair, offset + (margin - scene.margin), margin, names))
 
-    for k, (item, _, _) in enumerate(parts, start=count + len(own)):
-        is_grasped = item.name == scene.grasped
+    for k, (obstacle, _, _) in enumerate(parts, start=count + len(solids)):
+        is_grasped = obstacle.name == scene.grasped
         for i, link in enumerate(links):
             # No solution could change the distance of two fixed shapes.
-            is_fixed = model.is_fixed(link) and not (carried and is_grasped)
-            if not is_fixed and not (is_grasped and link in touched_by):
-                margin = scene.margin if item.margin is None else item.margin
+            is_fixed = model.is_fixed(link) and not (is_carried and is_grasped)
+            if not is_fixed and not (is_grasped and link in touching_links):
+                margin = scene.margin if obstacle.margin is None else obstacle.margin
                 may_penetrate = is_grasped and link in fingers
                 margin, offset = (0.0, -scene.enveloping) if may_penetrate else (margin, 0.0)
-                add((i, k), (link, item.name), margin, offset)
+                add((i, k), (link, obstacle.name), margin, offset)
     for (i, j), offset in zip(model.pairs.tolist(), model.offsets.tolist(), strict=True):
         add((i, j), model.names(i, j), scene.margin, offset)
     return PairTable(
         radii=model.radii,
-        halves=model.halves,
+        half_lengths=model.half_lengths,
         pairs=np.array([pair for pair, _, _, _ in rows], dtype=np.int32).reshape(-1, 2),
         offsets=np.array([offset for _, offset, _, _ in rows]),
-        own=len(own),
-        solids=(*own, *(solid for _, solid, _ in parts)),
-        places=tuple(place for _, _, place in parts),
-        items=tuple(item.name for item, _, _ in parts),
+        n_robot_solids=len(solids),
+        solids=(*solids, *(solid for _, solid, _ in parts)),
+        placements=tuple(placement for _, _, placement in parts),
+        items=tuple(obstacle.name for obstacle, _, _ in parts),
         names=tuple(names for _, _, _, names in rows),
         margins=np.array([margin for _, _, margin, _ in rows]),
         moving=model.moving,
@@ -276,35 +278,35 @@ def _finger_links(robot: RobotDescription) -> frozenset[str]:
 
 
 def check_base(model: CollisionModel, scene: Scene, shapes: Array, names: Collection[str]) -> None:
-    """Refuse a scene with an item inside the robot's base, where every target would collide.
+    """Refuse a scene with an obstacle in the robot's base, where every target would collide.
 
-    Shapes are larger than the base, so that a table below it may touch them. A penetration by more
-    than a shape's radius is an error of the scene.
+    Shapes enclose the base, and a table below it may touch them. A penetration by more than the
+    radius of a shape is an error of the scene.
 
     Args:
         model: Collision model of the robot.
         scene: The scene.
-        shapes: Poses of the shapes, as `shape_poses` returns them.
-        names: Names of the items to check.
+        shapes: Poses of the shapes, from `shape_poses`.
+        names: Names of the obstacles to check.
 
     Raises:
         DescriptionError: The axis of a capsule of the base is inside a solid.
     """
     may_touch = {frozenset(entry.links) for entry in scene.touching}
     for name in names:
-        item = scene.items[name]
+        obstacle = scene.items[name]
         for i, link in enumerate(model.links):
             if not model.is_fixed(link) or frozenset((link, name)) in may_touch:
                 continue
             segment = shapes[6 * i : 6 * i + 6].reshape(1, 1, 6)
             depths = [
-                -float(from_solid(solid, segment, pose_row(item.pose @ place)[None])[0].item())
-                for solid, place in item.parts
+                -float(from_solid(solid, segment, pose_row(obstacle.pose @ pose)[None])[0].item())
+                for solid, pose in obstacle.parts
             ]
             if max(depths) > 0:
                 depth = f"is {1e3 * max(depths):.1f} mm inside"
                 problem = depth if max(depths) >= 0.05e-3 else "touches"
                 raise DescriptionError(
                     f"{scene.name}: solids.{name}: {problem} {link!r}, which cannot move; expected "
-                    "a pose outside of the robot's base (or the two names under 'touching')"
+                    "a pose outside of the robot's base (or both names under 'touching')"
                 )

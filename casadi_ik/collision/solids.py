@@ -1,9 +1,9 @@
 """Solids of scenes, with one entry of `KIND_PROPERTIES` per kind, and their construction.
 
-A solid is defined in its own frame. A half-space is the volume below z = 0. A box, a cylinder
+A solid is defined in a local frame. A half-space is the volume below z = 0. A box, a cylinder
 (along z) and a capsule (along z) are centered at the origin. A convex body is the volume below its
-planes. A cloud is a set of balls around points. The planes of a round body are tangent to it, so
-that the body that they bound contains it and distances are never larger than the true ones.
+planes. A cloud is a set of balls around points. The planes of a round body are tangent to it:
+they bound a larger body, and distances are never larger than the true ones.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, optional_import
 from casadi_ik.files.arrays import Array
+from casadi_ik.model.mesh_shape import MeshShape
 from casadi_ik.model.objects import load_object
 from casadi_ik.model.shapes import (
     BentCapsule,
@@ -26,7 +27,6 @@ from casadi_ik.model.shapes import (
     Cylinder,
     EllipticCylinder,
     Mesh,
-    MeshShape,
     Shape,
     Sphere,
     box_mesh,
@@ -52,7 +52,7 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A solid in its own frame.
+    """A solid in a local frame.
 
     Attributes:
         kind: The kind.
@@ -133,7 +133,7 @@ KIND_PROPERTIES: dict[Kind, KindProperties] = {
     Kind.HALF_SPACE: KindProperties(
         distance=lambda _, p: p[..., 2],
         mesh=lambda _: box_mesh(np.array([0.7, 0.7, 5e-4]), np.array([0, 0, -5e-4])),
-        size="all below z = 0 of its pose",
+        size="the half-space below z = 0 of its pose",
     ),
     Kind.CAPSULE: KindProperties(
         distance=_capsule_distance,
@@ -188,9 +188,9 @@ def half_space() -> Solid:
     return _solid(Kind.HALF_SPACE, (), math.inf)
 
 
-def capsule(radius: float, half: float) -> Solid:
-    """Return a capsule along z with half length `half` [m] of its segment; 0: a ball."""
-    return _solid(Kind.CAPSULE, (radius, half), radius + half)
+def capsule(radius: float, half_length: float) -> Solid:
+    """Return a capsule along z; a ball if the half length of its segment [m] is 0."""
+    return _solid(Kind.CAPSULE, (radius, half_length), radius + half_length)
 
 
 def box(size: tuple[float, float, float]) -> Solid:
@@ -215,14 +215,14 @@ def convex(points: Array, normals: Array, surface: Mesh | None = None) -> Solid:
 
 
 def _planes(normals: Array, support: Callable[[Array], Array], spread_count: int = 512) -> Array:
-    """Return tangent planes (m, 4) of a body: evenly spread ones, then those of its faces.
+    """Return tangent planes (m, 4): evenly spread ones, then planes of the faces.
 
     A corner between 512 spread planes protrudes by at most 2 % of its distance. The driver checks
     the first few planes before all, so a stride through the spiral spreads any first planes evenly.
 
     Args:
-        normals: (k, 3) normals of its faces.
-        support: Function from directions (m, 3) to the support of the body (m,).
+        normals: (k, 3) normals of the faces.
+        support: Support function, from directions (m, 3) to largest coordinates along them (m,).
         spread_count: Number of evenly spread planes.
     """
     order = (np.arange(spread_count) * 197) % spread_count
@@ -275,10 +275,10 @@ def _split_points(points: Array, max_points: int) -> Iterator[Array]:
         yield points
         return
     # All parts but the last one are full.
-    half = max_points * (math.ceil(len(points) / max_points) // 2)
-    order = np.argpartition(points[:, np.ptp(points, axis=0).argmax()], half)
-    yield from _split_points(points[order[:half]], max_points)
-    yield from _split_points(points[order[half:]], max_points)
+    middle = max_points * (math.ceil(len(points) / max_points) // 2)
+    order = np.argpartition(points[:, np.ptp(points, axis=0).argmax()], middle)
+    yield from _split_points(points[order[:middle]], max_points)
+    yield from _split_points(points[order[middle:]], max_points)
 
 
 def grid_centers(points: Array, edge: float) -> tuple[Array, float]:
@@ -438,16 +438,13 @@ def primitive_solids(shape: Shape) -> list[PosedSolid]:
 
 
 def _elliptic_solid(shape: EllipticCylinder) -> Solid:
-    half = np.array([shape.width, shape.depth, shape.height]) / 2
+    a, b, c = np.array([shape.width, shape.depth, shape.height]) / 2
     faces = np.concatenate([circle(64), [[0, 0, 1.0], [0, 0, -1.0]]])
 
     def support(directions: Array) -> Array:
-        return (
-            np.hypot(directions[:, 0] * half[0], directions[:, 1] * half[1])
-            + np.abs(directions[:, 2]) * half[2]
-        )
+        return np.hypot(directions[:, 0] * a, directions[:, 1] * b) + np.abs(directions[:, 2]) * c
 
-    reach = math.hypot(max(half[0], half[1]), half[2])
+    reach = math.hypot(max(a, b), c)
     return Solid(Kind.CONVEX, np.zeros(3), reach, _planes(faces, support), shape.mesh(48))
 
 
@@ -480,8 +477,8 @@ def ray_points(solid: Solid, directions: Array) -> Array:
     low, high = np.zeros(len(directions)), np.full(len(directions), 1.01 * solid.reach)
     for _ in range(50):
         middle = (low + high) / 2
-        inside = solid.distance(middle[:, None] * directions) < 0
-        low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+        is_inside = solid.distance(middle[:, None] * directions) < 0
+        low, high = np.where(is_inside, middle, low), np.where(is_inside, high, middle)
     return high[:, None] * directions
 
 

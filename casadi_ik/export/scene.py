@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from casadi_ik.collision.clearance import ROUNDING, SceneCheck
-from casadi_ik.collision.model import CollisionModel, own_solids
+from casadi_ik.collision.clearance import DISTANCE_ROUNDING, SceneCheck
+from casadi_ik.collision.model import CollisionModel, robot_solids
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import C_NAMES, EXPORTED_KINDS
 from casadi_ik.compile.codegen import define, define_arrays, driver_text, number
@@ -183,7 +183,7 @@ class SceneSources:
     @property
     def rounding(self) -> float:
         """Rounding error by which the clearance of an answer may fall below the margin [m]."""
-        return ROUNDING if self.single is None else 0.0
+        return DISTANCE_ROUNDING if self.single is None else 0.0
 
     @property
     def min_limit_margin(self) -> float:
@@ -414,13 +414,13 @@ class SceneSources:
         """Return the constants of the scene's C file."""
         model, robot = self.model, self.robot
         link_index = {name: i for i, name in enumerate(self.links)}
-        solids, attached = own_solids(robot.description), robot.description.shapes.solids
+        solids, attached = robot_solids(robot.description), robot.description.shapes.solids
         contact_links = self.check.finger_bodies
         pairs, capsules = model.pairs, model.capsules
         groups = [self.pair_group(*model.names(i, j)) for i, j in pairs.tolist()]
         arrays: dict[str, np.ndarray] = {
             "RADII": model.radii,
-            "HALVES": model.halves,
+            "HALVES": model.half_lengths,
             "LINK": np.array([link_index[capsule.link] for capsule in capsules]),
             "FIXED": np.array([int(model.is_fixed(capsule.link)) for capsule in capsules]),
             "MOVING": np.array([self.pair_group(capsule.link) for capsule in capsules]),

@@ -53,17 +53,17 @@ class LinkCapsule:
     """A capsule or sphere of the robot.
 
     Attributes:
-        link: Link that carries it.
-        center: (3,) centre of its segment in the link's frame [m].
-        half: (3,) vector from the centre to the segment's end [m]; zero for a sphere.
+        link: Link that carries the capsule.
+        center: (3,) centre of the segment in the link's frame [m].
+        half_axis: (3,) vector from the centre to the end of the segment [m]; zero for a sphere.
         radius: Radius [m].
-        covers: Index of the solid of the robot that it encloses with others; -1: it is a shape
-            itself.
+        covers: Index of the solid of the robot that this capsule helps to enclose; -1: the
+            capsule is a shape itself.
     """
 
     link: str
     center: Array
-    half: Array
+    half_axis: Array
     radius: float
     covers: int = -1
 
@@ -134,7 +134,7 @@ class Shapes:
                 replace(
                     capsule,
                     center=read_only(capsule.center * across),
-                    half=read_only(capsule.half * across),
+                    half_axis=read_only(capsule.half_axis * across),
                 )
                 for capsule in self.capsules
             ),

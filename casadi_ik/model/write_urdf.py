@@ -130,15 +130,15 @@ def _add_collisions(element: ElementTree.Element, link: str, robot: RobotDescrip
     for capsule in robot.shapes.capsules:
         if capsule.link != link or capsule.covers >= 0:
             continue
-        length = 2 * float(np.linalg.norm(capsule.half))
+        length = 2 * float(np.linalg.norm(capsule.half_axis))
         radius = repr(capsule.radius)
-        center, half = capsule.center, capsule.half
-        for end in [center] if length == 0 else [center - half, center + half]:
+        center, half_axis = capsule.center, capsule.half_axis
+        for end in [center] if length == 0 else [center - half_axis, center + half_axis]:
             pose = np.eye(4)
             pose[:3, 3] = end
             _collision(element, pose, "sphere", radius=radius)
         if length:
-            pose = _pose_along(2 * half)
+            pose = _pose_along(2 * half_axis)
             pose[:3, 3] = center
             _collision(element, pose, "cylinder", radius=radius, length=repr(length))
     for solid in robot.shapes.solids:

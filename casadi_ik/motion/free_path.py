@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
+from casadi_ik.collision.clearance import DISTANCE_ROUNDING, CollisionQuery
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.kinematics.arm_hand import ArmHand
 
@@ -87,8 +87,8 @@ class _Sampler:
         reach = np.array([solid.reach for solid in table.solids])
         # A half-space may translate, but scenes do not rotate it.
         bounded_reach = np.where(np.isfinite(reach), reach, 0.0)
-        self._robot_reach = bounded_reach[: table.own]
-        self._scene_reach = bounded_reach[table.own :]
+        self._robot_reach = bounded_reach[: table.n_robot_solids]
+        self._scene_reach = bounded_reach[table.n_robot_solids :]
         self._capsules = len(table.radii)
 
     def evaluate(self, q: Array, solid_poses: Array, block: int = 4096) -> _Samples:
@@ -162,7 +162,7 @@ def check_path(query: CollisionQuery, q: Array, find_minimum: bool = False) -> P
         # Among several samples of a segment the last assignment counts: the minimum clearance.
         clearances[segment[smaller]] = samples.clearances[smaller]
         worst[segment[smaller]] = samples.q[smaller]
-        free[segment[~(samples.surplus >= -ROUNDING)]] = False
+        free[segment[~(samples.surplus >= -DISTANCE_ROUNDING)]] = False
 
     record(start, segment)
     record(end, segment)

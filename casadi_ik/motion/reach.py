@@ -88,7 +88,7 @@ class CarriedObject:
             return self._check.collision_query(problems).rows(np.zeros(1, dtype=np.intp))
         poses = self._palm(q) @ self._in_palm
         carrying = replace(problems, object=self._name, object_pose=poses)
-        return self._check.collision_query(carrying, carried=True)
+        return self._check.collision_query(carrying, is_carried=True)
 
     def _object_contact(self, q: Array, initial: float | None = None) -> str:
         """Return the contact of the object with an obstacle as text, "" if there is none.

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
+from casadi_ik.collision.clearance import DISTANCE_ROUNDING, CollisionQuery
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.poses import single_pose
@@ -520,7 +520,7 @@ class _CandidateChunk:
             if arms is not None:
                 hand_query = hand_query.hand_pairs
             surplus = hand_query.check(q).surplus
-        free_rows = np.flatnonzero(surplus >= -ROUNDING)
+        free_rows = np.flatnonzero(surplus >= -DISTANCE_ROUNDING)
         solutions, solution_candidate = q[free_rows], candidate[free_rows]
         if arms is not None:
             solutions, hand = self._arms(solutions, solution_candidate, surplus[free_rows])

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
+from casadi_ik.collision.clearance import DISTANCE_ROUNDING, CollisionQuery
 from casadi_ik.compile import FunctionKernel
 from casadi_ik.compile.cancellation import DriverCode, check
 from casadi_ik.compile.codegen import c_struct, driver_text
@@ -302,7 +302,7 @@ class ArmSearch:
                 job.check = _address(kernel.entry)
                 job.clearance = ctypes.addressof(clearance_job)
                 job.poses, job.pose_step = clearance_job.poses, clearance_job.pose_step
-                job.margin, job.rounding = query.margin, ROUNDING
+                job.margin, job.rounding = query.margin, DISTANCE_ROUNDING
                 job.clearance_bounds = surplus[rows].ctypes.data
             code = self._run(ctypes.byref(job))
             del buffers  # The driver reads their memory.

@@ -27,7 +27,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
+from casadi_ik.collision.clearance import DISTANCE_ROUNDING, CollisionQuery
 from casadi_ik.collision.distances import PairTable
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.targets import CLEARANCE, TargetBatch
@@ -162,7 +162,7 @@ class CollisionFreeSearch:
                 pool_targets, pool_surplus, COLLISION_FREE_PARAMETERS.pool_size
             )
             self._pool = pool_q[selected], pool_targets[selected], pool_surplus[selected]
-        free_rows = np.flatnonzero(surplus >= -ROUNDING)
+        free_rows = np.flatnonzero(surplus >= -DISTANCE_ROUNDING)
         if len(free_rows):
             free_q, free_targets = q[free_rows], target_index[free_rows]
             score = self.finder.score(
@@ -203,8 +203,8 @@ class CollisionFreeSearch:
         is_new = self._known_hands.add(coordinates, target_index)
         self._has_new_hands[target_index[is_new]] = True
         self.hands.append((q[is_new], target_index[is_new], surplus[is_new]))
-        free_rows = np.flatnonzero(surplus >= -ROUNDING)
-        np.add.at(self.arms_tried, target_index[surplus < -ROUNDING], 1)
+        free_rows = np.flatnonzero(surplus >= -DISTANCE_ROUNDING)
+        np.add.at(self.arms_tried, target_index[surplus < -DISTANCE_ROUNDING], 1)
         is_new = self._searched_hands.add(coordinates[free_rows], target_index[free_rows])
         rows = free_rows[is_new]
         rows = rows[self._preference_order(q[rows], target_index[rows])]
@@ -374,7 +374,7 @@ class CollisionFreeSearch:
 
     def _move_trunk_and_arms(self, sides: SideHands) -> None:
         """Move trunk and arms around the least-penetrating solutions; the palms stay in place."""
-        has_hand_collision = (sides.surplus < -ROUNDING).any(axis=0)
+        has_hand_collision = (sides.surplus < -DISTANCE_ROUNDING).any(axis=0)
         for number, (size, max_depth) in enumerate(COLLISION_FREE_PARAMETERS.carry_steps):
             q, target_index, surplus = self._pool
             is_blocked = ~(self.free | has_hand_collision)[target_index]
@@ -394,7 +394,7 @@ class CollisionFreeSearch:
             for number in range(len(motor_steps) + len(contact_steps)):
                 surplus = np.where(self.free, 0.0, sides.surplus[side])
                 is_shallow = surplus > -COLLISION_FREE_PARAMETERS.max_penetration
-                rows = np.flatnonzero((surplus < -ROUNDING) & is_shallow)
+                rows = np.flatnonzero((surplus < -DISTANCE_ROUNDING) & is_shallow)
                 if not len(rows):
                     break
                 least_penetrating = sides.least_penetrating[side][rows]

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.collision.clearance import ROUNDING, CollisionQuery
+from casadi_ik.collision.clearance import DISTANCE_ROUNDING, CollisionQuery
 from casadi_ik.files.arrays import Array, Bools, spread_steps
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
@@ -82,7 +82,7 @@ class SideHands:
         self.least_penetrating[side, target_index[rows]] = q[rows]
         self.surplus[side, target_index[rows]] = surplus[rows]
         rows = rows if best_only else np.arange(len(q))
-        rows = rows[surplus[rows] >= -ROUNDING]
+        rows = rows[surplus[rows] >= -DISTANCE_ROUNDING]
         q, target_index = q[rows], target_index[rows]
         palms, ranges = (
             side_palms(self._subproblems.robot, q),
@@ -254,7 +254,7 @@ class UnconstrainedFingers:
         # Unconstrained fingers cannot resolve a collision of other links.
         rows = rows[other_pairs.rows(target_index[rows]).free(q[rows])]
         surplus = free_finger_pairs.rows(target_index[rows]).check(q[rows]).surplus
-        collides = surplus < -ROUNDING
+        collides = surplus < -DISTANCE_ROUNDING
         rows, surplus = rows[collides], surplus[collides]
         if not len(rows):
             return q
@@ -274,7 +274,7 @@ class UnconstrainedFingers:
             is_better = best_surplus > surplus
             result[rows[is_better]] = candidates[numbers, best][is_better]
             surplus = np.maximum(surplus, best_surplus)
-            can_improve = (surplus < -ROUNDING) & (
+            can_improve = (surplus < -DISTANCE_ROUNDING) & (
                 surplus > -UNCONSTRAINED_FINGER_PARAMETERS.max_gain
             )
             rows, surplus = rows[can_improve], surplus[can_improve]

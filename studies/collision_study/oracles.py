@@ -37,8 +37,8 @@ class CoalOracle:
         table, geometry = around.table, pinocchio.GeometryModel()
         ids: list[int | None] = []
         for i, capsule in enumerate(robot.description.shapes.capsules):
-            length, radius = float(np.linalg.norm(capsule.half)), capsule.radius
-            turn = rotation_to(capsule.half / length) if length else np.eye(3)
+            length, radius = float(np.linalg.norm(capsule.half_axis)), capsule.radius
+            turn = rotation_to(capsule.half_axis / length) if length else np.eye(3)
             shape = coal.Capsule(radius, 2 * length) if length else coal.Sphere(radius)
             ids.append(
                 self._add(geometry, f"capsule{i}", capsule.link, turn, capsule.center, shape)
@@ -56,7 +56,7 @@ class CoalOracle:
                 case _:  # of planes: known to coal by corners only, left out here
                     ids.append(None)
                     continue
-            if k < table.own:
+            if k < table.n_robot_solids:
                 solid = robot.description.shapes.solids[k]
                 ids.append(
                     self._add(
@@ -69,7 +69,7 @@ class CoalOracle:
                     )
                 )
             else:
-                flat = poses[k - table.own]
+                flat = poses[k - table.n_robot_solids]
                 ids.append(
                     self._add(geometry, f"solid{k}", None, flat[:9].reshape(3, 3), flat[9:], shape)
                 )
@@ -167,18 +167,18 @@ def with_shapes(
         body = bodies.get(capsule.link, world)
         link_of_geom[i] = body.name
         size, place = [capsule.radius, 0, 0], {"pos": capsule.center}
-        if np.any(capsule.half):
+        if np.any(capsule.half_axis):
             place = {
                 "fromto": np.concatenate(
-                    [capsule.center - capsule.half, capsule.center + capsule.half]
+                    [capsule.center - capsule.half_axis, capsule.center + capsule.half_axis]
                 )
             }
-        kind = kinds.mjGEOM_CAPSULE if np.any(capsule.half) else kinds.mjGEOM_SPHERE
+        kind = kinds.mjGEOM_CAPSULE if np.any(capsule.half_axis) else kinds.mjGEOM_SPHERE
         body.add_geom(name=f"g{i}", type=kind, size=size, **place)
     poses = around.poses.reshape(-1, 12)
     for k, solid in enumerate(table.solids):
         turn, number = np.empty(4), len(shapes.capsules) + k
-        if k < table.own:
+        if k < table.n_robot_solids:
             link_solid = shapes.solids[k]
             body, rotation, at = (
                 bodies.get(link_solid.link, world),
@@ -186,7 +186,7 @@ def with_shapes(
                 link_solid.pose[:3, 3],
             )
         else:
-            flat = poses[k - table.own]
+            flat = poses[k - table.n_robot_solids]
             body, rotation, at = world.add_body(name=f"solid{k}"), flat[:9], flat[9:]
         kind = {
             Kind.BOX: kinds.mjGEOM_BOX,

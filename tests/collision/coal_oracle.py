@@ -19,11 +19,11 @@ def described(robot: ArmHand) -> list[tuple[str, Any, Array]]:
     solids: list[tuple[str, Any, Array]] = []
     for capsule in shapes.capsules:
         if capsule.covers < 0:
-            length = float(np.linalg.norm(capsule.half))
+            length = float(np.linalg.norm(capsule.half_axis))
             pose = np.eye(4)
             pose[:3, 3] = capsule.center
             if length:
-                pose[:3, :3] = frame_along(capsule.half / length)
+                pose[:3, :3] = frame_along(capsule.half_axis / length)
             solids.append((capsule.link, coal.Capsule(capsule.radius, 2 * length), pose))
     for solid in shapes.solids:
         x, y, z = solid.size.tolist()

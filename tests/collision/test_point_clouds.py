@@ -51,9 +51,9 @@ def by_hand(robot: ik.ArmHand, points: np.ndarray, q: np.ndarray) -> np.ndarray:
             continue
         pose = links[capsule.link]
         middle = pose[:, :3, :3] @ capsule.center + pose[:, :3, 3]
-        half_axis = pose[:, :3, :3] @ capsule.half
+        half_axis = pose[:, :3, :3] @ capsule.half_axis
         offsets = points - middle[:, None]
-        long = max(float(capsule.half @ capsule.half), 1e-30)
+        long = max(float(capsule.half_axis @ capsule.half_axis), 1e-30)
         t = np.clip(np.einsum("kmi,ki->km", offsets, half_axis) / long, -1, 1)
         separation = np.linalg.norm(offsets - t[..., None] * half_axis[:, None], axis=2).min(axis=1)
         clearance = np.minimum(clearance, separation - capsule.radius - RADIUS)

@@ -88,5 +88,5 @@ def test_obstacles_at_the_base_are_refused(tmp_path):
     post_in_base["post"]["xyz"][0] = 0.05 - 1e-5
     with pytest.raises(DescriptionError, match=r"solids.post:.*'base'"):
         ik.Solver(robot, scene=ik.Scene(post_in_base))
-    with pytest.raises(DescriptionError, match=r"touching.*unknown 'moon'"):
+    with pytest.raises(DescriptionError, match=r"touching.*'moon' is unknown"):
         ik.Solver(robot, scene=ik.Scene(SCENE, touching=[{"links": ["moon", "l1"], "reason": "x"}]))

@@ -70,7 +70,10 @@ def test_margins_of_single_pairs(robot) -> None:
 @pytest.mark.parametrize(
     ("margin", "message"),
     [
-        ({"links": ["moon", "a"], "margin": 0.1}, r"margins\[0\].links: unknown 'moon'; known: a"),
+        (
+            {"links": ["moon", "a"], "margin": 0.1},
+            r"margins\[0\].links: 'moon' is unknown; expected one of: a",
+        ),
         ({"links": ["a", "lwr_link_6"], "margin": -1}, r"margins\[0\].margin: found -1, expected"),
         ({"links": ["a", "a"], "margin": float("nan")}, r"margins\[0\].margin: found nan"),
     ],

@@ -137,10 +137,10 @@ def test_answers_are_collision_free_for_coal(careful, robot, candidates, cup):
         for shape in shapes:
             if shape.covers >= 0 or still(shape.link):
                 continue
-            length = float(np.linalg.norm(shape.half))
+            length = float(np.linalg.norm(shape.half_axis))
             turn = np.eye(3)
             if length:
-                z = shape.half / length
+                z = shape.half_axis / length
                 side = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
                 side /= np.linalg.norm(side)
                 turn = np.column_stack([side, np.cross(z, side), z])

@@ -13,13 +13,13 @@ import casadi as ca
 import numpy as np
 
 from casadi_ik.files.arrays import Array
+from casadi_ik.model.mesh_shape import MeshShape
 from casadi_ik.model.objects import GraspObject
 from casadi_ik.model.shapes import (
     BentCapsule,
     Box,
     Cylinder,
     EllipticCylinder,
-    MeshShape,
     Shape,
     Sphere,
 )

@@ -27,7 +27,7 @@ from casadi_ik.app.drawing.surfaces import (
     rod,
 )
 from casadi_ik.collision.clearance import ClosestPoints
-from casadi_ik.collision.model import own_solids
+from casadi_ik.collision.model import robot_solids
 from casadi_ik.collision.scene import Obstacle, Scene
 from casadi_ik.collision.solids import Solid
 from casadi_ik.errors import CasadiIKError, UnknownNameError
@@ -182,12 +182,16 @@ def collision_bodies(robot: ArmHand) -> list[Drawable]:
     link_shapes = [
         (
             capsule.link,
-            rod(capsule.center - capsule.half, capsule.center + capsule.half, capsule.radius),
+            rod(
+                capsule.center - capsule.half_axis,
+                capsule.center + capsule.half_axis,
+                capsule.radius,
+            ),
         )
         for capsule in shapes.capsules
         if capsule.covers < 0
     ]
-    for attached, solid in zip(shapes.solids, own_solids(description), strict=True):
+    for attached, solid in zip(shapes.solids, robot_solids(description), strict=True):
         mesh = mesh_shape(IndexedMesh(*solid.mesh()))
         link_shapes.append((attached.link, mesh.transformed(attached.pose)))
     return [_link_drawable(link, shape, styles) for link, shape in link_shapes]
@@ -437,7 +441,7 @@ def clearance_marks(closest: ClosestPoints, show_shapes: bool = False) -> list[D
         show_shapes: True to return the bounded shapes of the pair instead, enlarged by a millimetre
             for visibility.
     """
-    start, end = closest.ends
+    start, end = closest.points
     shapes = [rod(start, end, 0.0012), ball(0.0022, start), ball(0.0022, end)]
     if show_shapes:
         shapes = []

@@ -416,8 +416,8 @@ class ClearanceLine:
         self._rod.visible, self._label.visible = is_visible, is_visible and show_label
         if closest is None or not is_visible:
             return
-        self._rod.points = closest.ends[None].astype(np.float32)
-        self._label.position = closest.ends.mean(axis=0)
+        self._rod.points = closest.points[None].astype(np.float32)
+        self._label.position = closest.points.mean(axis=0)
         length = closest.distance if clearance is None else clearance
         self._label.text = f"{1e3 * length:.1f} mm"
 

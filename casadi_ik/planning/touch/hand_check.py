@@ -75,7 +75,7 @@ class HandCheck:
             of_object: True for distances from the object, False for distances from the scene.
         """
         pairs, shapes = self._all_pairs, self.shapes
-        first = len(pairs.radii) + pairs.own
+        first = len(pairs.radii) + pairs.n_robot_solids
         is_grasped = np.array(
             [name == self.check.scene.grasped for name in pairs.items], dtype=bool
         )

@@ -319,7 +319,9 @@ class HandShapes:
             for k in range(f)
             for i in range(first[k], first[k + 1])
         ]
-        fingers = np.array([-1 if k is None else k for k in owner] + [-1] * self_pairs.own)
+        fingers = np.array(
+            [-1 if k is None else k for k in owner] + [-1] * self_pairs.n_robot_solids
+        )
         pairs, is_relevant = fingers[self_pairs.pairs], np.isin(self_pairs.pairs[:, 0], numbers)
         is_relevant &= np.isin(self_pairs.pairs[:, 1], numbers) | (
             self_pairs.pairs[:, 1] >= len(owner)
@@ -346,7 +348,7 @@ class HandShapes:
             numbers,
             np.ascontiguousarray(palm_segments[:, :count].reshape(s, n, count, 6)),
             np.ascontiguousarray(palm_segments[0, count:]),
-            2 * model.halves[numbers],
+            2 * model.half_lengths[numbers],
             first,
             np.array(pads, dtype=np.int64),
             is_clear,
