@@ -81,20 +81,20 @@ def check_method(method: str) -> None:
         )
 
 
-def check_folder(out: Path) -> None:
+def check_folder(folder: Path) -> None:
     """Check that a folder may be written: it is missing, empty, or an earlier export.
 
     Raises:
         InputError: The path is another file or folder.
     """
-    with os_errors(f"--out: {out}", InputError):
-        if out.is_symlink() or (out.exists() and not out.is_dir()):
+    with os_errors(f"--out: {folder}", InputError):
+        if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
             raise InputError(
-                f"--out: {out} is not a folder; expected a new one or an earlier export"
+                f"--out: {folder} is not a folder; expected a new one or an earlier export"
             )
-        if out.is_dir() and any(out.iterdir()) and not (out / EXPORT_MARKER).is_file():
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / EXPORT_MARKER).is_file():
             raise InputError(
-                f"--out: {out} is not empty and not an earlier export; nothing was written"
+                f"--out: {folder} is not empty and not an earlier export; nothing was written"
             )
 
 
@@ -252,16 +252,16 @@ def c_project(
     }
 
 
-def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
+def write_folder(folder: Path, files: Mapping[str, str | bytes]) -> None:
     """Write a folder atomically, replacing an earlier export.
 
     Raises:
         InputError: The folder cannot be written; no part of it remains.
     """
-    check_folder(out)
+    check_folder(folder)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         try:
             for name, content in files.items():
                 path = temporary / name
@@ -273,20 +273,20 @@ def write_folder(out: Path, files: Mapping[str, str | bytes]) -> None:
             )
             temporary.chmod(0o755)
             replaced = temporary.with_name(temporary.name + ".old")
-            if out.exists():
-                out.rename(replaced)
+            if folder.exists():
+                folder.rename(replaced)
             try:
-                temporary.rename(out)
+                temporary.rename(folder)
             except OSError:
                 if replaced.exists():
-                    replaced.rename(out)
+                    replaced.rename(folder)
                 raise
             shutil.rmtree(replaced, ignore_errors=True)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
     except OSError as error:
-        raise InputError(f"--out: {out}: cannot be written: {error.strerror}") from error
+        raise InputError(f"--out: {folder}: cannot be written: {error.strerror}") from error
 
 
 # Fused multiply-adds would change the last bits of the solutions.

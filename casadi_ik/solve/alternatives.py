@@ -26,8 +26,8 @@ from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.row_selection import distinct_rows
 from casadi_ik.solve.solution import Alternative, ArmBranch
 from casadi_ik.solve.subproblems import (
-    Bounds,
     LocalRefinement,
+    MotorBounds,
     SubproblemSolver,
     palm_coordinates,
     sample_trunks,
@@ -212,7 +212,7 @@ class AlternativeFinder:
         (q0,) = targets.starts(self.robot.description)
         return solutions[int(np.argmax(self.score(solutions, q0, prefer)))]
 
-    def _postures(self, targets: TargetBatch, limits: Bounds) -> list[Array]:
+    def _postures(self, targets: TargetBatch, limits: MotorBounds) -> list[Array]:
         """Return solutions (n,) with different hands, from all candidates of all restarts."""
         subproblems, method = self.subproblems, self.subproblems.method
         restarts = range(method.options.rounds)
@@ -258,7 +258,7 @@ class AlternativeFinder:
         targets: TargetBatch,
         q: Array,
         posture: int,
-        limits: Bounds,
+        limits: MotorBounds,
         prefer: str,
         query: CollisionQuery | None = None,
     ) -> list[_Candidate]:
@@ -306,7 +306,7 @@ class AlternativeFinder:
             return [candidates[i] for i in distinct_rows(fractions, ALTERNATIVES.min_difference)]
         return self._refine_candidates(targets, candidates) or [_Candidate(q, posture)]
 
-    def _closed_form_bounds(self, bound: Array, limits: Bounds) -> Array:
+    def _closed_form_bounds(self, bound: Array, limits: MotorBounds) -> Array:
         """Return bounds (a,) of the arm, with fixed joints in the revolution of the closed form."""
         middle = (self.robot.lower + self.robot.upper) / 2
         revolutions = np.floor((bound - middle + np.pi) / FULL_TURN)

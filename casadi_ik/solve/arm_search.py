@@ -29,7 +29,7 @@ from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
 from casadi_ik.model.targets import CLEARANCE
 
-SYMBOL = "casadi_ik_arm_search"
+ARM_SEARCH_SYMBOL = "casadi_ik_arm_search"
 
 FULL_TURN = 2 * np.pi
 """Full revolution [rad]."""
@@ -179,8 +179,8 @@ class ArmSearch:
     def _load(self) -> Any:
         parts = map(driver_text, ("map_job", "clearance_job", "arm_search"))
         driver = "".join(("#include <stdint.h>\n", *parts))
-        library = load_library("arm_search", lambda: driver, SYMBOL, driver)
-        return None if library is None else library[SYMBOL]
+        library = load_library("arm_search", lambda: driver, ARM_SEARCH_SYMBOL, driver)
+        return None if library is None else library[ARM_SEARCH_SYMBOL]
 
     def choose(
         self,

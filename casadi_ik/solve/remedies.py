@@ -20,7 +20,12 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.diagnosis import Freed, Relief, Remedies
 from casadi_ik.solve.solution import BatchSolution, SuggestedFix
-from casadi_ik.solve.subproblems import Bounds, LocalRefinement, SubproblemSolver, repeat_target
+from casadi_ik.solve.subproblems import (
+    LocalRefinement,
+    MotorBounds,
+    SubproblemSolver,
+    repeat_target,
+)
 
 RELAXATION_HALVINGS = 8
 """Number of bisection steps that minimize the relaxation of limits."""
@@ -41,7 +46,7 @@ class RelaxedLimits:
     name: str
     columns: tuple[int, ...]
 
-    def widen(self, robot: ArmHand, bounds: Bounds, row: int) -> None:
+    def widen(self, robot: ArmHand, bounds: MotorBounds, row: int) -> None:
         """Widen the bounds of a row by pi, or by the range of a prismatic actuator."""
         for i in self.columns:
             is_angle = robot.description.actuators[i].unit == "rad"
@@ -73,7 +78,7 @@ def relaxation_candidates(
 def relax_limits(
     subproblems: SubproblemSolver,
     targets: TargetBatch,
-    limits: Bounds,
+    limits: MotorBounds,
     solved: list[tuple[RelaxedLimits, Array]],
     q: Array,
 ) -> Iterator[Relief]:
@@ -96,11 +101,11 @@ def relax_limits(
     violation = limits.violation(best)
     for _ in range(RELAXATION_HALVINGS):
         fraction = (lower + upper) / 2
-        bounds = Bounds(
+        bounds = MotorBounds(
             limits.lower + np.minimum(violation, 0) * fraction,
             limits.upper + np.maximum(violation, 0) * fraction,
         )
-        twice = Bounds(np.tile(bounds.lower, (2, 1)), np.tile(bounds.upper, (2, 1)))
+        twice = MotorBounds(np.tile(bounds.lower, (2, 1)), np.tile(bounds.upper, (2, 1)))
         starts = np.concatenate([best, np.tile(q, (count, 1))])
         refined = descent.run(rows, starts, twice)
         solved_rows = subproblems.solved(targets, refined, limits=False).reshape(2, count)
@@ -155,7 +160,7 @@ class RemedyFinder:
         if self._solves(candidates, self._refine(candidates, bounds), bounds).any():
             return True
         # All limits relaxed together help if any of them does.
-        last = Bounds(bounds.lower[-1:], bounds.upper[-1:])
+        last = MotorBounds(bounds.lower[-1:], bounds.upper[-1:])
         q = self.subproblems.search(self.targets, last)
         return bool(self._solves(self.targets, q, last)[0])
 
@@ -189,7 +194,7 @@ class RemedyFinder:
                 yield Freed(item, finger, q)
 
     @property
-    def _limits(self) -> Bounds:
+    def _limits(self) -> MotorBounds:
         return self.subproblems.limits(self.targets)
 
     def _relaxations(self) -> list[RelaxedLimits]:
@@ -200,7 +205,7 @@ class RemedyFinder:
             self.subproblems.robot, movable, movable & self.may_block, self.hand_only
         )
 
-    def _relaxed_bounds(self, relaxations: list[RelaxedLimits]) -> Bounds:
+    def _relaxed_bounds(self, relaxations: list[RelaxedLimits]) -> MotorBounds:
         bounds = self._limits.tiled(len(relaxations))
         for i, relaxation in enumerate(relaxations):
             relaxation.widen(self.subproblems.robot, bounds, i)
@@ -230,24 +235,24 @@ class RemedyFinder:
             )
         return relaxed_targets
 
-    def _solutions(self, candidates: TargetBatch, bounds: Bounds) -> dict[int, Array]:
+    def _solutions(self, candidates: TargetBatch, bounds: MotorBounds) -> dict[int, Array]:
         """Return solutions by row, fitted from the nearest configuration or found by a search."""
         q = self._refine(candidates, bounds)
         solved_rows = self._solves(candidates, q, bounds)
         failed = np.flatnonzero(~solved_rows)
         if len(failed):
-            remaining_bounds = Bounds(bounds.lower[failed], bounds.upper[failed])
+            remaining_bounds = MotorBounds(bounds.lower[failed], bounds.upper[failed])
             remaining = candidates.rows(failed)
             q[failed] = self.subproblems.search(remaining, remaining_bounds)
             solved_rows[failed] = self._solves(remaining, q[failed], remaining_bounds)
         return {int(i): q[i] for i in np.flatnonzero(solved_rows)}
 
-    def _refine(self, candidates: TargetBatch, bounds: Bounds) -> Array:
+    def _refine(self, candidates: TargetBatch, bounds: MotorBounds) -> Array:
         rows = np.arange(len(candidates))
         starts = np.tile(self.q, (len(rows), 1))
         return LocalRefinement(self.subproblems, candidates).run(rows, starts, bounds)
 
-    def _solves(self, candidates: TargetBatch, q: Array, bounds: Bounds) -> NDArray[np.bool_]:
+    def _solves(self, candidates: TargetBatch, q: Array, bounds: MotorBounds) -> NDArray[np.bool_]:
         is_within_bounds = (bounds.violation(q) == 0).all(axis=1)
         return np.logical_and(
             is_within_bounds, self.subproblems.solved(candidates, q, limits=False)

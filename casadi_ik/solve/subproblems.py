@@ -36,7 +36,7 @@ PALM_SCALES = np.array([0.1, 0.1, 0.1, 2.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
+class MotorBounds:
     """Bounds of the actuators, (n,) or (k, n)."""
 
     lower: Array
@@ -46,18 +46,18 @@ class Bounds:
         """Return configurations clipped to the bounds."""
         return np.clip(q, self.lower, self.upper)
 
-    def select_rows(self, rows: Rows) -> Bounds:
+    def select_rows(self, rows: Rows) -> MotorBounds:
         """Return the bounds of the targets with these indices."""
-        return self if self.lower.ndim == 1 else Bounds(self.lower[rows], self.upper[rows])
+        return self if self.lower.ndim == 1 else MotorBounds(self.lower[rows], self.upper[rows])
 
     @property
-    def first(self) -> Bounds:
+    def first(self) -> MotorBounds:
         """(n,) bounds of the first target; the bounds of the arm are the same for all targets."""
-        return self if self.lower.ndim == 1 else Bounds(self.lower[0], self.upper[0])
+        return self if self.lower.ndim == 1 else MotorBounds(self.lower[0], self.upper[0])
 
-    def tiled(self, count: int) -> Bounds:
+    def tiled(self, count: int) -> MotorBounds:
         """Return shared bounds as (k, n)."""
-        return Bounds(np.tile(self.lower, (count, 1)), np.tile(self.upper, (count, 1)))
+        return MotorBounds(np.tile(self.lower, (count, 1)), np.tile(self.upper, (count, 1)))
 
     def violation(self, q: Array) -> Array:
         """Return signed violations of the bounds: > 0 above, < 0 below, 0 within."""
@@ -86,11 +86,11 @@ class SubproblemSolver:
         """Layout of the parameters of the loop."""
         return self.method.step.layouts.parameters
 
-    def limits(self, targets: TargetBatch) -> Bounds:
+    def limits(self, targets: TargetBatch) -> MotorBounds:
         """Return the bounds of solutions, (n,) or (k, n), see `TargetBatch.bounds`."""
-        return Bounds(*targets.bounds(self.robot.description))
+        return MotorBounds(*targets.bounds(self.robot.description))
 
-    def search(self, targets: TargetBatch, bounds: Bounds) -> Array:
+    def search(self, targets: TargetBatch, bounds: MotorBounds) -> Array:
         """Run the first restart of hand-first for each of k targets.
 
         Args:
@@ -136,7 +136,7 @@ class SubproblemSolver:
         """Return (k,) True where q solves its target; within limits if `limits`."""
         return judge(self.robot, targets, q).solved(limits)
 
-    def set_bounds(self, parameters: Array, bounds: Bounds) -> None:
+    def set_bounds(self, parameters: Array, bounds: MotorBounds) -> None:
         """Set the bounds in rows of parameters."""
         parameters[:, self.parameters.slice("lower")] = bounds.lower
         parameters[:, self.parameters.slice("upper")] = bounds.upper
@@ -167,7 +167,7 @@ class LocalRefinement:
         self._states, self._parameters = refinement_rows(subproblems.method, targets, home)
 
     def run(
-        self, owner: Rows, q: Array, bounds: Bounds | None = None, weights: Array | None = None
+        self, owner: Rows, q: Array, bounds: MotorBounds | None = None, weights: Array | None = None
     ) -> Array:
         """Refine configurations.
 

@@ -276,10 +276,10 @@ def cross_matrices(vectors: Array) -> Array:
     return np.cross(vectors[..., None, :], np.eye(3)).swapaxes(-1, -2)
 
 
-LoadJob = c_struct("load_job", driver="touch")
+LoadJob = c_struct("load_job", driver="loads")
 
 COLUMN_SIZE = 14 * 4
-"""Number of scalars in a column of four concurrent linear programs (runtime/touch.c)."""
+"""Number of scalars in a column of four concurrent linear programs (runtime/loads.c)."""
 
 
 def _solve_programs(wrenches: Array, directions: Array) -> Array:

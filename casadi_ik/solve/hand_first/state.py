@@ -147,7 +147,7 @@ TRUNK_KEPT_ACROSS_RESTARTS = (
 )
 """State fields of multi-arm robots kept across restarts: the trunk trials."""
 
-UNKNOWN = float("nan")
+NOT_COMPUTED = float("nan")
 """Value of a record field that a stage does not compute."""
 
 
@@ -341,7 +341,7 @@ class HandFirstLayouts:
         phase: Phase,
         trial: TrialStep | None = None,
         accepted: Expr = 0.0,
-        margin: Expr = UNKNOWN,
+        margin: Expr = NOT_COMPUTED,
     ) -> Expr:
         """Return the record of an iteration at q (n, 1), except its status.
 
@@ -354,7 +354,7 @@ class HandFirstLayouts:
             accepted: 1 if the step was accepted.
             margin: Margin of the best arm, if the stage places the arm.
         """
-        residual, cost, size = ca.SX.nan(self.contacts.size), UNKNOWN, UNKNOWN
+        residual, cost, size = ca.SX.nan(self.contacts.size), NOT_COMPUTED, NOT_COMPUTED
         if trial is not None:
             residual = trial.residual_before[: self.contacts.size]
             cost, size = ca.sumsqr(trial.residual_before), trial.max_change
@@ -379,8 +379,8 @@ class HandFirstLayouts:
             {
                 "q": q,
                 **numbers,
-                "position_error": ca.if_else(weights[:, 0] > 0, positions, UNKNOWN),
-                "angle_error": ca.if_else(has_angle, angles, UNKNOWN),
+                "position_error": ca.if_else(weights[:, 0] > 0, positions, NOT_COMPUTED),
+                "angle_error": ca.if_else(has_angle, angles, NOT_COMPUTED),
                 **coupling_values(robot, q),
                 "limit_mask": pack_bits(ca.logic_or(q <= lower, q >= upper)),
                 "status": 0.0,  # set after the choice of the next stage
