@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -78,12 +77,9 @@ def test_help(run: Command) -> None:
 
 @pytest.mark.parametrize("name", sorted(COMMANDS.keys() - GROUPS.keys()))
 def test_help_texts_are_short(name: str) -> None:
-    """A noun phrase or an infinitive of at most 60 characters, the default included."""
+    """They have at most 60 characters, the default included."""
     for option in load(name).options:
-        text = option.help_text
-        assert len(text) <= 60, (option.name, text)
-        assert not re.match(r"(what|which|whether|how|where|when|as|if|it|there)\b", text), text
-        assert "unless said" not in text
+        assert len(option.help_text) <= 60, option.name
 
 
 def test_layouts_of_candidates_are_listed(run: Command) -> None:
