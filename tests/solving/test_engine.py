@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import pickle
+import sys
+from pathlib import Path
+from types import FrameType
 
 import numpy as np
 import pytest
@@ -166,3 +169,26 @@ def test_limits_of_a_coupled_joint(own_robot):
     q = np.tile(robot.home, (2, 1))
     q[:, 7] = np.radians([59, 61])
     np.testing.assert_array_equal(limits_ok(robot, q), [True, False])
+
+
+def test_a_solve_enters_few_files(robot: ik.ArmHand) -> None:
+    """A reader follows a solve through twelve Python files at most, and q0 through ten."""
+    solver, grasp = ik.Solver(robot), grasp_at(robot, robot.home)
+    solver._engine.method.prepare()
+    assert solver.solve(grasp, q0=robot.home).success
+    package = Path(ik.__file__).parent
+    files, files_of_q0 = set[str](), set[str]()
+
+    def record_file(frame: FrameType, event: str, _: object) -> None:
+        if event == "return" and Path(frame.f_code.co_filename).is_relative_to(package):
+            files.add(frame.f_code.co_filename)
+            if {"q0", "start", "starts", "targets"} & frame.f_locals.keys():
+                files_of_q0.add(frame.f_code.co_filename)
+
+    sys.setprofile(record_file)
+    try:
+        solver.solve(grasp, q0=robot.home)
+    finally:
+        sys.setprofile(None)
+    assert 1 < len(files) <= 12, files
+    assert 1 < len(files_of_q0) <= 10, files_of_q0
