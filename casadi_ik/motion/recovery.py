@@ -58,7 +58,7 @@ MAX_STOPS = 6
 After another stop the follower compares postures again, because the target may have moved.
 """
 
-MET = 1 + TOLERANCE_SLACK
+MAX_MET_RATIO = 1 + TOLERANCE_SLACK
 """Maximum error ratio at which the contacts are met."""
 
 
@@ -137,7 +137,7 @@ class Recovery:
         if self._cycles_to_check <= 0:
             self._extend_trail(q)
         ratio = inputs.error_ratio
-        if is_stopped or (ratio > MET and inputs.goal_error_ratio > MET):
+        if is_stopped or (ratio > MAX_MET_RATIO and inputs.goal_error_ratio > MAX_MET_RATIO):
             if self._has_met:
                 self._check_progress(inputs, ratio, q if is_stopped else None)
         else:
@@ -194,7 +194,7 @@ class Recovery:
         if self._cycles_stuck <= self._patience:
             return
         if self._candidate < 0:
-            if stopped_q is not None and inputs.exact_error_ratio(stopped_q) <= MET:
+            if stopped_q is not None and inputs.exact_error_ratio(stopped_q) <= MAX_MET_RATIO:
                 self._start_clock(math.inf)
                 return
             self._candidate, self._least_ratio = self._count - 1, math.inf

@@ -379,13 +379,13 @@ class Watch(ca.Callback):
         self._path.append(x)
         self._rows.append(rows)
         r, joints = rows[: self._contacts], rows[self._contacts :]
-        met = r @ r < MAX_SOLVED_RESIDUAL**2 and within(joints, self._joints)
-        np.frombuffer(res[0], dtype=float)[0] = met or is_cancelled()
+        is_solved = r @ r < MAX_SOLVED_RESIDUAL**2 and within(joints, self._joints)
+        np.frombuffer(res[0], dtype=float)[0] = is_solved or is_cancelled()
         return 0
 
 
 def within(joints: Array, limits: tuple[Array, Array]) -> bool:
-    """Return whether coupled joints are within their lower and upper limits."""
+    """Return True if coupled joints are within their lower and upper limits."""
     return bool(
         np.all(joints >= limits[0] - JOINT_SLACK) and np.all(joints <= limits[1] + JOINT_SLACK)
     )
@@ -576,6 +576,6 @@ def _step_sizes(path: Array) -> Array:
 def _ending(run: NlpRun, targets: TargetBatch, contacts: ContactRows) -> Status:
     """Return the status of a run: SOLVED if all contacts are within tolerance, else Ipopt's."""
     distances, angles = contact_errors(contacts, run.residual[None])
-    met = np.all(distances <= targets.position_tolerance)
-    met = met and np.all(angles <= targets.angle_tolerance)
-    return Status.SOLVED if met and run.within_limits else run.status
+    is_met = np.all(distances <= targets.position_tolerance)
+    is_met = is_met and np.all(angles <= targets.angle_tolerance)
+    return Status.SOLVED if is_met and run.within_limits else run.status
