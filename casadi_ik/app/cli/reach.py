@@ -18,15 +18,15 @@ from casadi_ik.errors import MissingExtraError
     Option("ROBOT", "robot name or YAML file"),
     Option(
         "--region VALUES...",
-        "corners of the box: x y z x y z [m] (default: around the arm)",
+        "box corners: x y z x y z [m] (default: around the arm)",
         parse=lambda words: opt.numbers(words, 6, "x y z x y z"),
     ),
     Option("--orientations N", "number of palm orientations", 32, opt.integer(1)),
     Option("--resolution M", "distance of positions [m]", 0.05, opt.positive),
     Option("--meaning exact|tolerance", "palm pose itself, or within the solver's tolerance"),
-    opt.LIMITS,
+    opt.LIMIT_MODE,
     Option("--jobs N", "threads", 1, opt.integer(1)),
-    opt.out("MAP.npz", "output file of the map", opt.file_name(".npz", ".ply", ".parquet")),
+    opt.out_option("MAP.npz", "output file of the map", opt.file_name(".npz", ".ply", ".parquet")),
     opt.picture("--picture", "picture of three layers"),
 )
 def reach_map(args: Arguments) -> CommandResult:
