@@ -26,6 +26,7 @@ from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.papers.qiu.step import FINGER_STEPS
 from casadi_ik.planning.choose import choose
 from casadi_ik.planning.object_pose import solve_with_object
+from casadi_ik.planning.reach.place_base import place_base
 from casadi_ik.planning.reach.reach_map import reach_map
 from casadi_ik.planning.touch.grasps import grasps_of
 from casadi_ik.solve.alternatives import DEFAULT_SEPARATION
@@ -492,6 +493,7 @@ class Solver(MovingSolver):
 
     choose = choose
     reach_map = reach_map
+    place_base = place_base
     grasps_of = grasps_of
 
     def sensitivity(

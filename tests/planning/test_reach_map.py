@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
+from casadi_ik.app.cli.main import main
 from casadi_ik.planning.reach.reach_map import ReachMap
 
 BOX = ([-0.9, -0.9, -0.2], [0.9, 0.9, 1.0])
@@ -93,3 +94,14 @@ def test_bad_input_is_refused(solver, arguments, name):
     if name == "region":
         with pytest.raises(ik.errors.UnsupportedError, match="reach_map"):
             ik.Solver(ik.load_robot("allegro_right")).reach_map(BOX)
+
+
+def test_the_command_writes_map_and_picture(tmp_path):
+    box = ["--region", "0", "0", "0", "0.6", "0.6", "0.6", "--resolution", "0.3"]
+    files = ["--out", str(tmp_path / "m.npz"), "--picture", str(tmp_path / "m.png")]
+    assert main(["map", "ur5e", *box, "--orientations", "2", *files]) == 0
+    assert ReachMap.load(tmp_path / "m.npz").shape == (3, 3, 3)
+    assert (tmp_path / "m.png").stat().st_size > 1000
+    flat = ["--region", "0", "0", "0", "0.6", "0.6", "0"]
+    assert main(["map", "ur5e", *flat, "--out", str(tmp_path / "flat.npz")]) == 2
+    assert not (tmp_path / "flat.npz").exists()

@@ -41,6 +41,7 @@ COMMANDS = {
     "batch": ("batch.batch", "solve many targets of one robot"),
     "follow": ("motion.follow", "follow a moving hand, or moving contacts"),
     "reach": ("motion.reach", "plan a timed motion to a grasp"),
+    "place-base": ("reach.place_base", "place the base to reach most palm poses"),
     "map": ("reach.reach_map", "map the palm poses that an arm can reach"),
     "grasp": ("grasp.grasp", "find feasible grasps of an object's mesh"),
     "choose": ("solve.choose", "rank candidate grasps of an object"),

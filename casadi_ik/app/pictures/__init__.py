@@ -15,11 +15,12 @@ with optional_import("pictures"):
 from casadi_ik.app.pictures.charts import draw_convergence
 from casadi_ik.app.pictures.grasps import draw_alternatives, draw_grasps
 from casadi_ik.app.pictures.pictures import draw_motion, draw_pads, draw_solution, show
-from casadi_ik.app.pictures.reach import draw_reach_map
+from casadi_ik.app.pictures.reach import draw_base_placement, draw_reach_map
 from casadi_ik.app.pictures.study_report import study_page
 
 __all__ = [
     "draw_alternatives",
+    "draw_base_placement",
     "draw_convergence",
     "draw_grasps",
     "draw_motion",

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.pictures.charts import DPI, new_figure, save_picture
 from casadi_ik.errors import InputError
+from casadi_ik.planning.reach.place_base import BasePlacement
 from casadi_ik.planning.reach.reach_map import ReachMap
 
 COLORS = "viridis"
@@ -62,6 +63,43 @@ def draw_reach_map(
     if image is not None:
         bar = figure.colorbar(image, cax=figure.add_axes((0.92, 0.15, 0.015, 0.6)))
         bar.set_label("reachable orientations", color=palette.FAINT)
+    if path is not None:
+        save_picture(figure, path)
+    return figure
+
+
+def draw_base_placement(
+    placement: BasePlacement,
+    path: str | PathLike[str] | None = None,
+    *,
+    title: str = "",
+    dpi: float = DPI,
+) -> Figure:
+    """Draw the bases that were evaluated, coloured by the number of palm poses they reach.
+
+    Args:
+        placement: Result of `Solver.place_base`.
+        path: PNG file to write; None: none.
+        title: Title; "": best number and proved bound.
+        dpi: Dots per inch.
+
+    Raises:
+        PictureError: The file cannot be written.
+    """
+    figure = new_figure(6.4, 5.2, dpi)
+    ax = figure.add_axes((0.12, 0.11, 0.68, 0.76))
+    order = placement.counts.argsort(kind="stable")
+    x, y = placement.bases[order, :2].T
+    points = ax.scatter(x, y, c=placement.counts[order], cmap=COLORS, s=24, linewidths=0)
+    ax.plot(*placement.base[:2], marker="*", color="#d62f3c", markersize=15, linestyle="none")
+    ax.set_xlabel("x of the base [m]", color=palette.FAINT)
+    ax.set_ylabel("y of the base [m]", color=palette.FAINT)
+    ax.set_aspect("equal")
+    bar = figure.colorbar(points, cax=figure.add_axes((0.83, 0.11, 0.025, 0.76)))
+    bar.set_label("palm poses reached", color=palette.FAINT)
+    total = len(placement.reached)
+    text = f"best base: {placement.count} of {total}, proved bound {placement.upper_bound}"
+    figure.suptitle(title or text, color=palette.INK, fontsize=11)
     if path is not None:
         save_picture(figure, path)
     return figure
