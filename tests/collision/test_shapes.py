@@ -387,3 +387,27 @@ def test_shapes_come_back_from_the_urdf(tmp_path):
     solid = next(item for item in robot.description.shapes.solids if item.link == "l2")
     np.testing.assert_allclose(place, solid.pose, atol=1e-12)
     np.testing.assert_allclose(2 * np.asarray(box.geometry.halfSide), solid.size, atol=1e-12)
+
+
+def test_equal_meshes_of_two_links_get_equal_shapes(rng):
+    """In any order of triangles and except for rounding; a mirrored mesh is not equal."""
+    t = np.array([0.02, 0.0, 0.02])
+    mesh = trimesh.util.concatenate(
+        [
+            trimesh.creation.box((0.02, 0.02, 0.06)),
+            trimesh.creation.box((0.02, 0.02, 0.02), trimesh.transformations.translation_matrix(t)),
+            trimesh.creation.box(
+                (0.02, 0.02, 0.02), trimesh.transformations.translation_matrix(-t)
+            ),
+        ]
+    )
+    points, triangles = np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
+    first = IndexedMesh(points, triangles)
+    noise = rng.uniform(-1e-9, 1e-9, points.shape)
+    permuted = IndexedMesh(points + noise, triangles[rng.permutation(len(triangles))])
+    mirrored = IndexedMesh(points * [-1, 1, 1], triangles)
+    assert capsules.is_same(first, permuted)
+    assert not capsules.is_same(first, mirrored)
+    shapes = capsules.fit_links({"a": first, "b": permuted, "c": mirrored}, ())
+    assert shapes["a"] == shapes["b"]
+    assert shapes["a"] != shapes["c"]

@@ -72,6 +72,9 @@ class ShapeFitSettings:
 
 SHAPE_FIT = ShapeFitSettings()
 
+SAME_POINT = 1e-7
+"""Distance up to which points of two meshes are equal [m]; entries are rounded up by far more."""
+
 RADIUS_FACTORS = np.array([1.0, 1.02, 1.05, 1.1, 1.2, 1.35, 1.5])
 """Radii that are tried, relative to the smallest one."""
 
@@ -461,6 +464,7 @@ def fit_links(
         report: Function called with the number of links that have been enclosed since.
     """
     shapes: dict[str, list[ShapeEntry]] = {}
+    fitted: list[str] = []
     for link, mesh in meshes.items():
         extent = float(np.ptp(mesh.points, axis=0).max())
         if simple_shapes and link in simple_shapes:
@@ -469,11 +473,37 @@ def fit_links(
             count = (
                 max_capsules if extent > SHAPE_FIT.large_link else SHAPE_FIT.max_capsules_of_small
             )
-            triangles = mesh.points[mesh.triangles]
-            shapes[link] = _enclosing_shapes(triangles, count, link in flat, min_saving)
+            # The fingers of a hand often have the same phalanges, each in a separate file.
+            twin = next(
+                (
+                    candidate
+                    for candidate in fitted
+                    if (candidate in flat) == (link in flat) and is_same(mesh, meshes[candidate])
+                ),
+                None,
+            )
+            if twin is not None:
+                shapes[link] = list(shapes[twin])
+            else:
+                triangles = mesh.points[mesh.triangles]
+                shapes[link] = _enclosing_shapes(triangles, count, link in flat, min_saving)
+                fitted.append(link)
         if report is not None:
             report(1)
     return shapes
+
+
+def is_same(mesh: IndexedMesh, other_mesh: IndexedMesh) -> bool:
+    """Return whether two meshes have the same triangles in any order, except for rounding."""
+    if mesh.triangles.shape != other_mesh.triangles.shape:
+        return False
+    corners, other_corners = (m.points[m.triangles] for m in (mesh, other_mesh))
+    for end in (np.min, np.max):
+        if np.abs(end(corners, axis=(0, 1)) - end(other_corners, axis=(0, 1))).max() > SAME_POINT:
+            return False
+    tree = KDTree(other_corners.mean(axis=1))
+    distances, _ = tree.query(corners.mean(axis=1), distance_upper_bound=2 * SAME_POINT)
+    return bool(distances.max() <= SAME_POINT)
 
 
 def _enclosing_shapes(

@@ -67,6 +67,9 @@ class OverlapSampling:
 
 OVERLAP_SAMPLING = OverlapSampling()
 
+SPHERE_MARGIN = 1e-9
+"""Distance up to which separate bounding spheres count as overlapping, for rounding errors [m]."""
+
 
 def allowed_overlaps(
     part: RobotPart | RobotDescription,
@@ -109,8 +112,7 @@ def allowed_overlaps(
             pair: MeshPair | None = None
             # Only the points of a mesh are known if it has too many triangles.
             if all(name in meshes and len(meshes[name].triangles) for name in (link, other_link)):
-                relative = _inverse(poses[link]) @ poses[other_link]
-                pair = MeshPair(tree, (link, other_link), relative)
+                pair = MeshPair(tree, (link, other_link), (poses[link], poses[other_link]))
             touching += _allowed_overlap((link, other_link), clearance, pair)
         if report is not None:
             report(1)
@@ -143,12 +145,19 @@ Capsules = Sequence[tuple[Array, Array, float]]
 
 
 def _clearances(capsules: tuple[Capsules, Capsules], segments: tuple[Array, Array]) -> Array:
-    """Return the least distance (k,) of the capsules of two links [m], negative if they overlap."""
+    """Return the overlaps of the capsules of two links as negative distances (k,) [m].
+
+    Configurations in which the bounding spheres of all capsules are separate get infinity.
+    """
     clearance = np.full(OVERLAP_SAMPLING.samples, np.inf)
     for i, (_, _, radius) in enumerate(capsules[0]):
         for j, (_, _, other_radius) in enumerate(capsules[1]):
-            distance, _ = between_segments(segments[0][:, i], segments[1][:, j])
-            clearance = np.minimum(clearance, distance - radius - other_radius)
+            first, second = segments[0][:, i], segments[1][:, j]
+            half_lengths = np.linalg.norm(first[0, 3:]) + np.linalg.norm(second[0, 3:])
+            reach = half_lengths + radius + other_radius + SPHERE_MARGIN
+            rows = np.flatnonzero(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) < reach)
+            distance, _ = between_segments(first[rows], second[rows])
+            clearance[rows] = np.minimum(clearance[rows], distance - radius - other_radius)
     return clearance
 
 
@@ -159,19 +168,20 @@ class MeshPair:
     Attributes:
         tree: Function that returns the tree of a link's mesh.
         links: Names of the links.
-        relative: (k, 4, 4) pose of the second link in the first by configuration.
+        poses: (k, 4, 4) poses of both links by configuration.
     """
 
     tree: Callable[[str], CollisionTree]
     links: tuple[str, str]
-    relative: Array
+    poses: tuple[Array, Array]
 
     def intersects(
         self, configurations: NDArray[np.intp], stop_at_first: bool = False
     ) -> NDArray[np.bool_]:
         """Return in which configurations the meshes intersect; see `CollisionTree.intersects`."""
         first, second = map(self.tree, self.links)
-        return first.intersects(second, self.relative[configurations], stop_at_first)
+        pose, other_pose = (poses[configurations] for poses in self.poses)
+        return first.intersects(second, _inverse(pose) @ other_pose, stop_at_first)
 
 
 def _allowed_overlap(
