@@ -37,7 +37,7 @@ def reach_map(args: Arguments) -> CommandResult:
 
     Examples:
       casadi-ik map ur5e --out ur5e.npz --picture ur5e.png
-      casadi-ik map panda --region 0.2 -0.4 0 0.8 0.4 0.6 --resolution 0.02 --out panda.ply
+      casadi-ik map panda --region 0.2 -0.4 0 0.8 0.4 0.6 --out panda.ply
       casadi-ik map my_robot.yaml --orientations 96 --jobs 4 --out my.parquet
 
     Every palm pose is REACHABLE (with joint positions as a witness, which forward
