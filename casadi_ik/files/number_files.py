@@ -121,7 +121,8 @@ def read_mesh(path: Path, location: str) -> tuple[Array, NDArray[np.int64]]:
     if not path.is_file():
         raise DescriptionError(f"{location}: no such file {str(path)!r}")
     kind = path.suffix.lower()
-    location = f"{location}: {path.name}"
+    if not location.endswith(path.name):
+        location = f"{location}: {path.name}"
     if kind not in MESH_FORMATS:
         raise DescriptionError(
             f"{location}: found {kind!r}, expected one of {', '.join(MESH_FORMATS)}"
@@ -155,12 +156,12 @@ def _parse_mesh(data: bytes, kind: str) -> tuple[Array, NDArray[np.int64]]:
     points, triangles, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
     for vertices, faces in parts:
         # Files may keep vertices of triangles that were deleted.
-        used, numbers = np.unique(np.asarray(faces, dtype=np.int64), return_inverse=True)
-        if len(used) and not 0 <= used[0] <= used[-1] < len(vertices):
+        indices, numbers = np.unique(np.asarray(faces, dtype=np.int64), return_inverse=True)
+        if len(indices) and not 0 <= indices[0] <= indices[-1] < len(vertices):
             raise ValueError("a triangle refers to a vertex that does not exist")
-        points.append(np.asarray(vertices, dtype=np.float64)[used])
+        points.append(np.asarray(vertices, dtype=np.float64)[indices])
         triangles.append(numbers.reshape(-1, 3) + count)
-        count += len(used)
+        count += len(indices)
     return np.concatenate(points), np.concatenate(triangles)
 
 

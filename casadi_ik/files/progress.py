@@ -41,13 +41,13 @@ def progress(
     def advance(targets: int) -> None:
         nonlocal total, last_line, visible_bar
         total += targets
-        now = time.monotonic()
-        rate = (total - done) / max(now - began, 1e-9)
-        if draw is not None and now - began > FIRST_DRAW_DELAY:
+        time_now = time.monotonic()
+        rate = (total - done) / max(time_now - began, 1e-9)
+        if draw is not None and time_now - began > FIRST_DRAW_DELAY:
             visible_bar = draw
             draw(total, rate)
-        elif draw is None and say is not None and now - last_line > LINE_INTERVAL:
-            last_line = now
+        elif draw is None and say is not None and time_now - last_line > LINE_INTERVAL:
+            last_line = time_now
             time_left = _time_left(count - total, rate)
             say(f"{total:,} of {count:,} targets, {rate:,.0f} a second{time_left}")
 

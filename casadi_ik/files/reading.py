@@ -40,8 +40,8 @@ _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class _UniqueKeyLoader(_SafeLoader):
     """YAML loader that refuses duplicate keys, which YAML's own loader accepts silently.
 
-    It refuses merge keys (``<<``), too: they are not part of YAML 1.2, and what they override is
-    easily overlooked.
+    It refuses merge keys (``<<``), too: they are not part of YAML 1.2, and the values that
+    they override are easily overlooked.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:

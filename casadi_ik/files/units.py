@@ -135,7 +135,7 @@ def check_units(value: Any, type_: Any, path: Path, key: str = "", owner: Any = 
         check_units(value, inner, path, key, owner)
     elif origin in (Union, UnionType):
         for member in get_args(type_):
-            if _fits(value, member):
+            if _is_instance(value, member):
                 check_units(value, member, path, key, owner)
                 return
     elif isinstance(value, dict):
@@ -156,7 +156,7 @@ def _hints(type_: Any) -> dict[str, Any]:
     return get_type_hints(type_, include_extras=True) if is_struct else {}
 
 
-def _fits(value: Any, type_: Any) -> bool:
+def _is_instance(value: Any, type_: Any) -> bool:
     """Return True if a value fits one type of a union."""
     try:
         msgspec.convert(to_si(value), type_)

@@ -49,7 +49,7 @@ class Finger:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One arm-hand of a multi-arm robot.
+    """An arm-hand of a multi-arm robot.
 
     Attributes:
         name: Unique name ("left").
@@ -207,7 +207,7 @@ class RobotDescription:
 
     @cached_property
     def _independent_turns(self) -> NDArray[np.bool_]:
-        """(n,) True for motors that move one revolute joint, by their own angle."""
+        """Mask (n,) of the motors that move one revolute joint by an equal angle."""
         joints_of: dict[int, list[Joint]] = {i: [] for i in range(len(self.actuators))}
         for joint in self.movable:
             for motor in self.driving_actuators([joint.name]):
@@ -250,7 +250,7 @@ class RobotDescription:
 
     @cached_property
     def links(self) -> tuple[str, ...]:
-        """All links, the root first."""
+        """Names of the links; the root is first."""
         return links_of(self)
 
     def finger(self, name: str) -> Finger:
@@ -413,14 +413,14 @@ class RobotDescription:
     @cached_property
     def finger_motors(self) -> tuple[str, ...]:
         """Names of the actuators that move a finger relative to the palm, in the order of q."""
-        used = {i for name in self.finger_names for i in self.finger_actuators(name)}
-        return tuple(self.actuator_names[i] for i in sorted(used))
+        of_fingers = {i for name in self.finger_names for i in self.finger_actuators(name)}
+        return tuple(self.actuator_names[i] for i in sorted(of_fingers))
 
     @cached_property
     def finger_joints(self) -> tuple[str, ...]:
         """Names of all movable joints of the fingers, in the order of `joint_names`."""
-        used = {name for finger in self.fingers for name in finger.joints}
-        return tuple(name for name in self.joint_names if name in used)
+        of_fingers = {name for finger in self.fingers for name in finger.joints}
+        return tuple(name for name in self.joint_names if name in of_fingers)
 
     def links_moved(self, actuators: Collection[int]) -> frozenset[str]:
         """Return the links that any of some actuators (indices in q) moves."""

@@ -59,10 +59,10 @@ def real_array(value: Any) -> Array:
         TypeError: The value cannot be converted.
     """
     if isinstance(value, np.ma.MaskedArray):
-        raise ValueError("is a masked array; expected plain numbers (NaN marks free ones)")
+        raise ValueError("array is masked (NaN marks free numbers)")
     array = np.array(value)
     if array.dtype.kind == "c":
-        raise ValueError("is complex; expected real numbers")
+        raise ValueError("array is complex")
     return array if array.dtype == np.float64 else np.array(value, dtype=np.float64)
 
 

@@ -110,23 +110,23 @@ def _open_tree(entry: Entry, key: str, description: Path) -> tuple[RobotTree, st
 def _part(
     tree: RobotTree,
     entry: Entry,
-    chosen: tuple[tuple[TreeJoint, ...], tuple[TreeJoint, ...]],
+    arm_and_hand_joints: tuple[tuple[TreeJoint, ...], tuple[TreeJoint, ...]],
     end: LinkFrame,
     source: dict[str, str],
     location: str,
 ) -> RobotPart:
-    """Return the chosen joints as a part.
+    """Return joints of a file as a part of a robot.
 
     Args:
         tree: Joints of the file.
         entry: Entry of the description.
-        chosen: Joints of the arm (or above the palm), and joints of the hand.
+        arm_and_hand_joints: Joints of the arm (or above the palm), and joints of the hand.
         end: Frame of the tip or palm.
         source: Source of the numbers by tag.
-        location: Description and key, for messages.
+        location: Description and key for error messages.
     """
-    root = chosen[0][0].parent if chosen[0] else end.link
-    joints, actuators = _PartJoints(tree, entry, *chosen, location).convert()
+    root = arm_and_hand_joints[0][0].parent if arm_and_hand_joints[0] else end.link
+    joints, actuators = _PartJoints(tree, entry, *arm_and_hand_joints, location).convert()
     links = [root, *(joint.child for joint in joints)]
     shapes = NO_SHAPES
     if not tree.shapes.meshes & set(links):  # simple shapes alone would be incomplete
@@ -141,7 +141,7 @@ def _part(
 
 
 class _PartJoints:
-    """Conversion of the chosen joints of a file to joints and motors of a robot."""
+    """Conversion of the joints of a file to joints and motors of a robot."""
 
     def __init__(
         self,
@@ -152,7 +152,7 @@ class _PartJoints:
         location: str,
     ) -> None:
         self._tree = tree
-        self._where = f"{location}: {tree.path.name}"
+        self._location = f"{location}: {tree.path.name}"
         self._key = location
         self._arm = {joint.name for joint in chain}
         self._joints = {joint.name: joint for joint in (*chain, *hand)}
@@ -234,13 +234,13 @@ class _PartJoints:
             current = None if coupling is None or current in self._locked else coupling.of
             if current in chain:
                 raise DescriptionError(
-                    f"{self._where}: joint {name!r} mimics itself: "
+                    f"{self._location}: joint {name!r} mimics itself: "
                     f"{' -> '.join([*chain, current])}; write locked: {{{name}: 0}} under "
                     f"{self._key.rpartition(' ')[2]}"
                 )
         if current is not None and current not in self._tree.motors:
             raise DescriptionError(
-                f"{self._where}: joint {chain[-1]!r} mimics {current!r}, which is not a joint"
+                f"{self._location}: joint {chain[-1]!r} mimics {current!r}, which is not a joint"
             )
 
     def _fixed_position(self, name: str) -> float | None:
@@ -254,8 +254,8 @@ class _PartJoints:
             return 0.0
         if joint.type not in ("revolute", "continuous", "prismatic"):
             raise DescriptionError(
-                f"{self._where}: joint {name!r} is {joint.type}, which has no single axis; write "
-                f"locked: {{{name}: 0}} under {self._key.rpartition(' ')[2]}"
+                f"{self._location}: joint {name!r} is {joint.type}, which has no single axis; "
+                f"write locked: {{{name}: 0}} under {self._key.rpartition(' ')[2]}"
             )
         if joint.coupling is not None:
             source = self._fixed_position(joint.coupling.of)
@@ -288,7 +288,7 @@ class _PartJoints:
         if joint.type == "continuous":
             return -CONTINUOUS_RANGE, CONTINUOUS_RANGE
         raise DescriptionError(
-            f"{self._where}: joint {joint.name!r} of link {joint.child!r} has no limits; write "
+            f"{self._location}: joint {joint.name!r} of link {joint.child!r} has no limits; write "
             f"limits: {{{joint.name}: [LOWER, UPPER]}} under {self._key.rpartition(' ')[2]}"
         )
 
@@ -303,8 +303,8 @@ class _PartJoints:
                 break
             if not (isinstance(coupling, Linear) and isinstance(leader.coupling, Linear)):
                 raise DescriptionError(
-                    f"{self._where}: joint {joint.name!r} follows {name!r}, which is not part of "
-                    f"this robot; write locked: {{{joint.name}: 0}}"
+                    f"{self._location}: joint {joint.name!r} follows {name!r}, which is not part "
+                    f"of this robot; write locked: {{{joint.name}: 0}}"
                 )
             coupling = Linear(
                 leader.coupling.of,

@@ -128,13 +128,13 @@ class Shapes:
     def mirrored(self) -> Shapes:
         """Return the shapes of the mirror image, in which the y axis of every link is inverted."""
         mirror = np.diag([1.0, -1.0, 1.0, 1.0])
-        across = np.diagonal(mirror)[:3]
+        signs = np.diagonal(mirror)[:3]
         return Shapes(
             tuple(
                 replace(
                     capsule,
-                    center=read_only(capsule.center * across),
-                    half_axis=read_only(capsule.half_axis * across),
+                    center=read_only(capsule.center * signs),
+                    half_axis=read_only(capsule.half_axis * signs),
                 )
                 for capsule in self.capsules
             ),
@@ -262,23 +262,23 @@ def _box_capsules(size: Array, pose: Array) -> list[tuple[Array, Array, float]]:
 
 
 def _bar_capsule(
-    center: Array, axis: Array, half: float, corner_radius: float, pose: Array
+    center: Array, axis: Array, half_length: float, corner_radius: float, pose: Array
 ) -> tuple[Array, Array, float]:
     """Return the capsule of smallest volume, of 26 radii, that encloses a bar.
 
     Args:
         center: (3,) centre of the bar.
         axis: (3,) unit vector along the bar.
-        half: Half length of the bar [m].
-        corner_radius: Distance of its corners from its axis [m].
+        half_length: Half length of the bar [m].
+        corner_radius: Distance of the corners from the axis [m].
         pose: (4, 4) frame of centre and axis in the link.
     """
-    best = (math.inf, half, corner_radius)
+    best = (math.inf, half_length, corner_radius)
     for trial in np.linspace(1.0, 1.5, 26) * corner_radius:
         # The wider the capsule, the earlier its segment may end.
         shortening = math.sqrt(max(trial * trial - corner_radius * corner_radius, 0.0))
-        segment = max(half - shortening, 0.0)
-        radius = math.hypot(half, corner_radius) if segment == 0.0 else float(trial)
+        segment = max(half_length - shortening, 0.0)
+        radius = math.hypot(half_length, corner_radius) if segment == 0.0 else float(trial)
         volume = math.pi * radius * radius * (2 * segment + 4 / 3 * radius)
         best = min(best, (volume, segment, radius))
     _, segment, radius = best

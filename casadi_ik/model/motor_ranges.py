@@ -147,12 +147,12 @@ def _refined(q: Array, excess: Array) -> Array:
     return np.unique(np.concatenate([q, *finer]))
 
 
-def _edge(excess: Callable[[Array], Array], outside: float, inside: float) -> float:
+def _edge(excess: Callable[[Array], Array], infeasible: float, feasible: float) -> float:
     """Return the last feasible position before a limit is exceeded, by bisection."""
     for _ in range(SEARCH.halvings):
-        middle = (outside + inside) / 2
+        middle = (infeasible + feasible) / 2
         if excess(np.array([middle]))[0] <= 0:
-            inside = middle
+            feasible = middle
         else:
-            outside = middle
-    return inside
+            infeasible = middle
+    return feasible

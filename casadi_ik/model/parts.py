@@ -35,9 +35,9 @@ def check_couplings(joints: dict[str, Joint], actuators: list[Actuator], path: P
     """
     units = {joint.name: "m" if joint.type == "prismatic" else "rad" for joint in joints.values()}
     units |= {actuator.name: actuator.unit for actuator in actuators}
-    followed = {joint.coupling.of for joint in joints.values() if joint.coupling is not None}
+    sources = {joint.coupling.of for joint in joints.values() if joint.coupling is not None}
     for actuator in actuators:
-        if actuator.name not in joints and actuator.name not in followed:
+        if actuator.name not in joints and actuator.name not in sources:
             raise DescriptionError(
                 f"{path}: actuators.{actuator.name}: moves no joint; expected the name of a joint, "
                 "or a coupling that follows it"
@@ -62,11 +62,11 @@ def _check_coupling(
 ) -> None:
     """Check that a joint's couplings lead to an actuator."""
     location = f"{path}: joint {joint.name!r}"
-    followed, current = [joint.name], joint
+    sources, current = [joint.name], joint
     while current.coupling is not None:
         source = current.coupling.of
-        if source in followed:
-            cycle = " -> ".join([*followed, source])
+        if source in sources:
+            cycle = " -> ".join([*sources, source])
             raise DescriptionError(f"{location}: coupling.of: is a cycle {cycle}")
         if source in actuators:
             return
@@ -75,7 +75,7 @@ def _check_coupling(
                 f"{location}: coupling.of: unknown joint or actuator {source!r}; known: "
                 + ", ".join([*by_name, *sorted(actuators - set(by_name))])
             )
-        followed.append(source)
+        sources.append(source)
         current = by_name[source]
     if current.name not in actuators:
         raise DescriptionError(
@@ -152,7 +152,7 @@ class RobotPart:
 
     @property
     def links(self) -> tuple[str, ...]:
-        """All links, the root first."""
+        """Names of the links; the root is first."""
         return links_of(self)
 
     @property
@@ -210,8 +210,8 @@ def mirrored(part: RobotPart) -> RobotPart:
             inverted.add(joint.name)
         joints.append(replace(joint, axis=read_only(axis), placement=_mirrored(joint.placement)))
     # A motor that is not a joint changes its sign with the joints that follow it.
-    followed = {j.coupling.of for j in joints if j.coupling is not None and j.name in inverted}
-    inverted |= followed - {joint.name for joint in joints}
+    sources = {j.coupling.of for j in joints if j.coupling is not None and j.name in inverted}
+    inverted |= sources - {joint.name for joint in joints}
     return replace(
         part,
         joints=[_inverted_joint(joint, inverted) for joint in joints],

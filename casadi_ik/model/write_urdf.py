@@ -110,9 +110,9 @@ def _leaders(robot: RobotDescription) -> dict[str, tuple[str, float, float]]:
 def _add_visuals(
     element: ElementTree.Element, link: str, robot: RobotDescription, part: dict[str, str]
 ) -> None:
-    ends = [joint.placement[:3, 3] for joint in robot.joints if joint.parent == link]
-    ends += [finger.placement[:3, 3] for finger in robot.fingers if finger.link == link]
-    for end in ends:
+    endpoints = [joint.placement[:3, 3] for joint in robot.joints if joint.parent == link]
+    endpoints += [finger.placement[:3, 3] for finger in robot.fingers if finger.link == link]
+    for end in endpoints:
         length = float(np.linalg.norm(end))
         if length < 1e-4:
             continue

@@ -263,8 +263,8 @@ def shape_entry(kind: str, size: Sequence[float], pose: Array) -> ShapeEntry:
         return LinkCylinderEntry(
             radius=size[0], length=size[1], xyz=(x, y, z), rpy=(roll, pitch, yaw)
         )
-    half = pose[:3, 2] * size[1] / 2
-    first, last = (tuple((pose[:3, 3] + sign * half).tolist()) for sign in (-1, 1))
+    half_axis = pose[:3, 2] * size[1] / 2
+    first, last = (tuple((pose[:3, 3] + sign * half_axis).tolist()) for sign in (-1, 1))
     return LinkCapsuleEntry(ends=(first, last), radius=size[0])
 
 
@@ -368,7 +368,7 @@ class RobotTree:
 
     @cached_property
     def links(self) -> tuple[str, ...]:
-        """All links, the root first."""
+        """Names of the links; the root is first."""
         return links_of(self)
 
     @cached_property

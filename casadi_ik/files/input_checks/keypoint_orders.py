@@ -132,7 +132,7 @@ class OrderConverter:
     def __init__(self, location: str) -> None:
         """Store the name of the argument, for warnings."""
         self.name, self.is_decided = "", False
-        self._where, self._tries = location, 0
+        self._location, self._tries = location, 0
         self._newest: Array | None = None
 
     def assume_standard(self) -> None:
@@ -168,7 +168,7 @@ class OrderConverter:
 
     def _warn(self, problem: str) -> None:
         message = (
-            f"{self._where}: the keypoints {problem}; expected the order of {STANDARD_ORDER}: 0 "
+            f"{self._location}: the keypoints {problem}; expected the order of {STANDARD_ORDER}: 0 "
             "the wrist, then four for each finger from the thumb on, tips 4, 8, 12, 16, 20"
         )
         warnings.warn(message, InputWarning, stacklevel=2)

@@ -83,8 +83,8 @@ def lost_frame_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> s
     if len(set(map(tuple, rows))) < len(rows):
         return "two keypoints coincide"
     index, little = frame[KNUCKLES[0]] - frame[wrist], frame[KNUCKLES[1]] - frame[wrist]
-    squares, along = float(index @ index) * float(little @ little), float(index @ little)
-    if not squares - along**2 > FRAME_LIMITS.flatness**2 * squares:
+    squares, product = float(index @ index) * float(little @ little), float(index @ little)
+    if not squares - product**2 > FRAME_LIMITS.flatness**2 * squares:
         return "wrist and knuckles are on a line"
     return ""
 
@@ -92,8 +92,8 @@ def lost_frame_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> s
 def bone_lengths(frames: Array) -> Array:
     """Return the lengths (..., 20) of the bones of frames (..., 21, 3) [m]."""
     with np.errstate(invalid="ignore", over="ignore"):
-        along = frames[..., BONES[:, 1], :] - frames[..., BONES[:, 0], :]
-        return np.sqrt(np.einsum("...i,...i->...", along, along))
+        bones = frames[..., BONES[:, 1], :] - frames[..., BONES[:, 0], :]
+        return np.sqrt(np.einsum("...i,...i->...", bones, bones))
 
 
 class FrameFilter:

@@ -49,8 +49,8 @@ def nearest_rotations(matrices: Array) -> tuple[Array, Bools]:
     if not inexact.any():
         return matrices, invalid
     usable = np.where(invalid[..., None, None], np.eye(3), matrices)
-    left, _, right = np.linalg.svd(usable)
-    return np.where((inexact | invalid)[..., None, None], left @ right, matrices), invalid
+    u, _, vt = np.linalg.svd(usable)
+    return np.where((inexact | invalid)[..., None, None], u @ vt, matrices), invalid
 
 
 def checked_rotations(matrices: Array, location: str) -> Array:

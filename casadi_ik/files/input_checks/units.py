@@ -56,10 +56,10 @@ def warn_of_far_contacts(points: Array, location: str, base_travel: float = 0.0)
         base_travel: Distance that a mobile base travels [m].
     """
     max_distance = USUAL_SIZES.contact + base_travel
-    beyond = np.abs(points) > max_distance  # the test of a box is cheaper than lengths
-    if not beyond.any():
+    is_beyond = np.abs(points) > max_distance  # the test of a box is cheaper than lengths
+    if not is_beyond.any():
         return
-    distance = float(np.linalg.norm(points[beyond.any(axis=-1)][0]))
+    distance = float(np.linalg.norm(points[is_beyond.any(axis=-1)][0]))
     _warn(
         f"{location}: a contact is {distance:.4g} m from the robot's base; expected at most "
         f"{max_distance:.4g} m (numbers in mm? 1 mm is 0.001)"
