@@ -154,7 +154,7 @@ def place_base(
         raise InputError(f"resolution: found {resolution!r}, expected a length > 0 [m]")
     reach = PalmReach(robot, family, solver.limits == "enforce", solver._engine.compiled)
     search = _Search(reach, palms, lower, upper, resolution)
-    search.run(started + max_time)
+    search.run(time.perf_counter() + max_time)  # compiling does not count
     search.polish()
     decision = reach.decide(_in_base(palms, search.best))
     reached = decision.code == Reach.REACHABLE
