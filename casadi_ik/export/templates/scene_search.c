@@ -389,7 +389,7 @@ static int begin_trunk(search *job) {
     if (number % 2) fraction = clipped((fraction - 0.5) * TRUNK_STRETCH + 0.5, 0.0, 1.0);
     q[column] = low + fraction * (high - low);
   }
-  return begin_carrying(job, q, palms, number % 4 != 3 ? ARM_PLACEMENT_STAGE : TRUNK_PHASE);
+  return begin_carrying(job, q, palms, number % 4 != 3 ? ARM_PLACEMENT_STAGE : TRUNK_STAGE);
 }
 
 /* Starts the next task; returns 0 if there is none. */
