@@ -146,9 +146,12 @@ class SeedTable:
     def _finger_groups(self) -> tuple[FingerGroup, ...]:
         """Groups of fingers that share motors, each with its postures."""
         robot, count = self._robot, self._settings.finger_samples
+        # The fingers of a multi-arm robot begin at its trunk.
+        hand_motors = set(robot.description.hand_actuators)
         groups: list[tuple[set[int], set[int]]] = []
         for finger, name in enumerate(robot.fingers):
-            fingers, motors = {finger}, set(robot.description.finger_actuators(name))
+            finger_motors = robot.description.finger_actuators(name)
+            fingers, motors = {finger}, hand_motors.intersection(finger_motors)
             for group in [group for group in groups if group[1] & motors]:
                 groups.remove(group)
                 fingers, motors = fingers | group[0], motors | group[1]
