@@ -27,6 +27,7 @@ class SeedSettings:
     Attributes:
         regions: Number of regions of the arm's joint space.
         region_samples: Number of arm postures in each region.
+        regions_per_palm: Factor of the number of regions and seeds for a robot with several palms.
         finger_samples: Number of postures of each group of fingers that share motors.
         seeds: Number of seeds of each target, and additional ones per motor.
         candidates: Number of arm postures per seed for which the fingers are chosen.
@@ -35,6 +36,7 @@ class SeedSettings:
 
     regions: int = 128
     region_samples: int = 32
+    regions_per_palm: int = 4
     finger_samples: int = 512
     seeds: tuple[int, int] = (32, 2)
     candidates: int = 2
@@ -202,7 +204,7 @@ class SeedTable:
         Postures of a region are ``regions`` rows apart.
         """
         robot, settings, motors = self._robot, self._settings, self._arm_motors
-        regions = settings.regions
+        regions = settings.regions * self._palm_factor
         samples = spread_points(regions * settings.region_samples, max(len(motors), 1))
         order = _regions(samples[:, : len(motors)], regions)
         samples = samples[order]
@@ -268,20 +270,25 @@ class SeedTable:
         """Return the seeds (k, s, n) of some targets."""
         settings, (arms, palms, features) = self._settings, self._arms
         costs = (self._coefficients(goals, points, axes).astype(np.float32) @ features).reshape(
-            len(points), settings.region_samples, settings.regions
+            len(points), settings.region_samples, -1
         )
         lowest = costs.min(axis=1)
         seed_count = settings.seeds[0] + settings.seeds[1] * len(self._robot.actuators)
+        seed_count *= self._palm_factor
         factor = settings.candidates if self._has_free_fingers else 1
         regions = _smallest(lowest, factor * seed_count)
         target = np.arange(len(points))[:, None]
         sample = costs[target, :, regions].argmin(axis=2)
-        arm = sample * settings.regions + regions
+        arm = sample * lowest.shape[1] + regions
         seeds = arms[arm]
         if not self._has_free_fingers:
             return seeds
         total = self._choose_fingers(goals, palms[arm], seeds)
         return seeds[target, _smallest(total, seed_count)]
+
+    @cached_property
+    def _palm_factor(self) -> int:
+        return self._settings.regions_per_palm if len(self._robot.hands) > 1 else 1
 
     @cached_property
     def _has_free_fingers(self) -> bool:
