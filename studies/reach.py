@@ -106,7 +106,7 @@ def report(results: dict[str, dict[str, float]]) -> str:
 
 def main() -> None:
     """Measure the arms that have no part yet, and write the report."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("arms", nargs="*", default=ARMS)
     parser.add_argument("--cells", type=int, default=1_000_000)
     parser.add_argument("--forward", type=int, default=1_000_000)
