@@ -125,7 +125,7 @@ def main() -> None:
         if (RESULTS / f"{name}.json").exists()
     }
     text = "# Reachability maps\n\nProcessor time of one core; seed 0.\n\n" + report(results)
-    (RESULTS.parent / "reach.md").write_text(text, encoding="utf-8")
+    (RESULTS / "report.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
