@@ -38,7 +38,7 @@ def shipped_names(kind: str) -> tuple[str, ...]:
         >>> ik.shipped_names("scenes")
         ('table',)
         >>> len(ik.shipped_names("arms")), len(ik.shipped_names("hands"))
-        (24, 20)
+        (27, 20)
     """
     return tuple(sorted(path.stem for path in (models_folder() / kind).glob("*.yaml")))
 
