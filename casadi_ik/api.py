@@ -32,15 +32,12 @@ from casadi_ik.planning.touch.grasps import grasps_of
 from casadi_ik.solve.alternatives import DEFAULT_SEPARATION
 from casadi_ik.solve.engine import Engine, SolvedBlock, SolveOptions
 from casadi_ik.solve.fast import FastSolver
+from casadi_ik.solve.hand_postures import broadcast_postures
 from casadi_ik.solve.recorder import Recorder
 from casadi_ik.solve.registry import build_method, method_names, with_finger_step
 from casadi_ik.solve.sensitivity import Sensitivity
 from casadi_ik.solve.solution import Alternative, BatchSolution, Solution
-from casadi_ik.solve.target_builder import (
-    TargetBuilder,
-    broadcast_postures,
-    tolerances_by_finger,
-)
+from casadi_ik.solve.target_builder import TargetBuilder, tolerances_by_finger
 
 METHODS = method_names()
 """Names of the shipped methods, the default first."""
@@ -148,7 +145,7 @@ class Solver(MovingSolver):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the init arguments; a copy finds compiled kernels in the cache of its machine."""
-        return _build_solver, (type(self), self._init_args)
+        return partial(type(self), **self._init_args), ()
 
     def __repr__(self) -> str:
         return f"<Solver {self.method} on {self.robot.name}, limits {self.limits}>"
@@ -432,12 +429,9 @@ class Solver(MovingSolver):
             (4, True)
         """
         targets = self._target_builder.from_grasps([grasp], fixed=fixed, seed=seed)
-        finder, query = (
-            self._engine.engine_for(targets).finder,
-            self._engine.collision_query(targets),
-        )
+        query = self._engine.collision_query(targets)
         targets = targets.starting_at(self._target_builder.start(q0))
-        return finder.find(targets, limit, prefer, apart, query)
+        return self._engine.engine_for(targets).finder.find(targets, limit, prefer, apart, query)
 
     def solve_palms(
         self,
@@ -599,11 +593,5 @@ class Solver(MovingSolver):
             >>> bool(at_table.check(solution.q, grasp).distance[0] > 0)
             True
         """
-        targets = self._target_builder.from_grasps([grasp])
-        query = self._engine.collision_query(targets)
+        query = self._engine.collision_query(self._target_builder.from_grasps([grasp]))
         return query and query.check(np.atleast_2d(self.robot.configuration(q)))
-
-
-def _build_solver(kind: type[Solver], init_args: Mapping[str, Any]) -> Solver:
-    """Build a solver from named init arguments, for unpickling."""
-    return kind(**init_args)

@@ -49,7 +49,8 @@ from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.search_code import SearchPlan, source_text
 from casadi_ik.solve.hand_first.state import terms
-from casadi_ik.solve.target_builder import POSTURE_LIMIT_SLACK, contacts_from_palms
+from casadi_ik.solve.hand_postures import POSTURE_LIMIT_SLACK
+from casadi_ik.solve.target_builder import contacts_from_palms
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
 

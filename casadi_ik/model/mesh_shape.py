@@ -14,7 +14,7 @@ from casadi_ik.errors import DescriptionError, optional_import
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.units import warn_of_large_mesh
 from casadi_ik.files.limits import LIMITS, raise_hint, scaled_limit
-from casadi_ik.model.shapes import Mesh, Surface
+from casadi_ik.model.shapes import BaseShape, Mesh
 from casadi_ik.model.urdf_body import read_body
 
 
@@ -41,7 +41,7 @@ RAY_FRAMES = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3, 3)))[0]
 
 
 @dataclass(frozen=True, eq=False)
-class MeshShape(Surface):
+class MeshShape(BaseShape):
     """A solid bounded by triangles, in connected pieces.
 
     Attributes:

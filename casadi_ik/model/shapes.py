@@ -72,7 +72,7 @@ def capsule_mesh(radius: float, half_length: float, resolution: int = 32) -> Mes
     return tube_mesh(rings, -end, end)
 
 
-class Surface:
+class BaseShape:
     """Base class of shapes: signed distance and normal from the nearest surface point."""
 
     __slots__ = ()
@@ -97,7 +97,12 @@ class Surface:
 
 
 class Primitive(
-    Surface, msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", kw_only=True
+    BaseShape,
+    msgspec.Struct,
+    frozen=True,
+    forbid_unknown_fields=True,
+    tag_field="kind",
+    kw_only=True,
 ):
     """A shape of an object file.
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
 from casadi_ik.kinematics.intervals import interval_function
-from casadi_ik.planning.reach.decide import PalmReach, Reach, exact_family
+from casadi_ik.planning.reach.decide import PalmReach, Reachability, exact_family
 
 ARMS = ("ur5e", "kuka_lwr4", "panda", "irb140")
 """One arm of each exact family."""
@@ -35,8 +35,8 @@ def test_palms_of_configurations_are_reachable_with_witnesses(reach):
     q[:40] = np.where(at_limit, robot.upper, q)[:40]
     palms = robot.palm(q)
     decision = reach.decide(palms)
-    assert not (decision.code == Reach.UNREACHABLE).any()
-    witnessed = decision.code == Reach.REACHABLE
+    assert not (decision.code == Reachability.UNREACHABLE).any()
+    witnessed = decision.code == Reachability.REACHABLE
     assert witnessed[40:].all()
     assert witnessed.mean() > 0.9
     witness = decision.q[witnessed]
@@ -50,11 +50,11 @@ def test_refuted_palms_are_not_solved():
     reach, solver = PalmReach(robot, exact_family(robot)), ik.Solver(robot)
     poses = random_poses(7, 300, 1.0)
     exact, tolerant = reach.decide(poses), reach.decide(poses, ik.Tolerance())
-    refuted = tolerant.code == Reach.UNREACHABLE
+    refuted = tolerant.code == Reachability.UNREACHABLE
     assert refuted.sum() > 100
     assert not solver.solve_palms(poses[refuted], {}).success.any()
-    assert (exact.code[refuted] == Reach.UNREACHABLE).all()
-    assert (exact.code == Reach.OPEN).mean() < 0.01
+    assert (exact.code[refuted] == Reachability.UNREACHABLE).all()
+    assert (exact.code == Reachability.OPEN).mean() < 0.01
 
 
 def test_interval_functions_enclose_all_values():

@@ -29,7 +29,7 @@ from casadi_ik.planning.reach.margins import MarginKernels, model_deviation
 from casadi_ik.solve.verdict import LIMIT_SLACK
 
 
-class Reach(IntEnum):
+class Reachability(IntEnum):
     """Verdict about a palm pose.
 
     Example:
@@ -90,7 +90,7 @@ class PalmDecision:
     """Verdicts about k palm poses.
 
     Attributes:
-        code: (k,) verdict, see `Reach`.
+        code: (k,) verdict, see `Reachability`.
         q: (k, a) witness of the arm [rad]; NaN unless REACHABLE.
     """
 
@@ -204,7 +204,7 @@ class _Chunk:
         # A first sample decides more than half of the palm poses in reach at a tenth of the cost.
         rows = self._without_reached(rows, np.full(len(rows), values[0]))
         upper = self._upper_bounds(rows, np.full(len(rows), low), np.full(len(rows), high))
-        self.code[rows[upper < 0]] = Reach.UNREACHABLE
+        self.code[rows[upper < 0]] = Reachability.UNREACHABLE
         if low == high:
             return
         rows = rows[upper >= 0]
@@ -225,11 +225,11 @@ class _Chunk:
             is_open = self._upper_bounds(owner, lower, upper) >= 0
             owner, lower, upper = owner[is_open], lower[is_open], upper[is_open]
             self._without_reached(owner, (lower + upper) / 2)
-            is_open = self.code[owner] != Reach.REACHABLE
+            is_open = self.code[owner] != Reachability.REACHABLE
             owner, lower, upper = owner[is_open], lower[is_open], upper[is_open]
-        is_refuted = self.code[rows] == Reach.OPEN
+        is_refuted = self.code[rows] == Reachability.OPEN
         is_refuted[np.isin(rows, owner)] = False
-        self.code[rows[is_refuted]] = Reach.UNREACHABLE
+        self.code[rows[is_refuted]] = Reachability.UNREACHABLE
 
     def _upper_bounds(self, rows: Rows, lower: Array, upper: Array) -> Array:
         """Return upper bounds of the margins over intervals of the redundancy; inf if unknown."""
@@ -267,9 +267,9 @@ class _Chunk:
         is_witness = (score >= REACH_PARAMETERS.limit_tolerance) & reaches(
             reach.robot, q, rotation, origin
         )
-        self.code[hit_rows[is_witness]] = Reach.REACHABLE
+        self.code[hit_rows[is_witness]] = Reachability.REACHABLE
         self.q[hit_rows[is_witness]] = q[is_witness]
-        return rows[self.code[rows] != Reach.REACHABLE]
+        return rows[self.code[rows] != Reachability.REACHABLE]
 
 
 def reaches(robot: ArmHand, q: Array, rotation: Array, origin: Array) -> NDArray[np.bool_]:

@@ -27,7 +27,7 @@ from casadi_ik.planning.object_pose import pose_matrices
 from casadi_ik.planning.reach.decide import (
     REACH_PARAMETERS,
     PalmReach,
-    Reach,
+    Reachability,
     exact_family,
     redundancy_range,
 )
@@ -153,11 +153,11 @@ def place_base(
     if not isinstance(resolution, int | float) or not 0 < resolution < np.inf:
         raise InputError(f"resolution: found {resolution!r}, expected a length > 0 [m]")
     reach = PalmReach(robot, family, solver.limits == "enforce", solver._engine.compiled)
-    search = _Search(reach, palms, lower, upper, resolution)
+    search = _PlacementSearch(reach, palms, lower, upper, resolution)
     search.run(time.perf_counter() + max_time)  # compiling does not count
     search.polish()
     decision = reach.decide(_in_base(palms, search.best))
-    reached = decision.code == Reach.REACHABLE
+    reached = decision.code == Reachability.REACHABLE
     return BasePlacement(
         search.best,
         reached,
@@ -218,7 +218,7 @@ def _in_base(palms: Array, base: Array) -> Array:
     return result
 
 
-class _Search:
+class _PlacementSearch:
     """Branch and bound for one robot and its palm poses.
 
     Attributes:

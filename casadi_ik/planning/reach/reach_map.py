@@ -25,7 +25,7 @@ from casadi_ik.planning.reach.decide import (
     REACH_PARAMETERS,
     Meaning,
     PalmReach,
-    Reach,
+    Reachability,
     exact_family,
 )
 from casadi_ik.solve.target_files import import_polars
@@ -46,7 +46,7 @@ class ReachMap:
         positions: (g, 3) positions of the palm in the base frame [m].
         rotations: (m, 3, 3) orientations of the palm; (g, 3, 3) without a grid.
         shape: Numbers of positions along x, y and z; empty without a grid.
-        code: (g, m) verdicts, see `Reach`; (g, 1) without a grid.
+        code: (g, m) verdicts, see `Reachability`; (g, 1) without a grid.
         q: (g, m, a) witnesses of the arm [rad], NaN unless REACHABLE; None if they are not kept.
 
     Example:
@@ -70,23 +70,23 @@ class ReachMap:
     @property
     def status(self) -> NDArray[np.str_]:
         """(g, m) verdicts by name."""
-        return np.array([verdict.name for verdict in Reach])[self.code]
+        return np.array([verdict.name for verdict in Reachability])[self.code]
 
     @property
     def counts(self) -> dict[str, int]:
         """Number of palm poses by verdict."""
-        numbers = np.bincount(self.code.ravel(), minlength=len(Reach))
-        return {verdict.name: int(numbers[verdict]) for verdict in Reach}
+        numbers = np.bincount(self.code.ravel(), minlength=len(Reachability))
+        return {verdict.name: int(numbers[verdict]) for verdict in Reachability}
 
     @cached_property
     def share(self) -> Array:
         """(g,) share of the orientations that are reachable at each position."""
-        return (self.code == Reach.REACHABLE).mean(axis=1)
+        return (self.code == Reachability.REACHABLE).mean(axis=1)
 
     @cached_property
     def open_share(self) -> Array:
         """(g,) share of the orientations that are open at each position."""
-        return (self.code == Reach.OPEN).mean(axis=1)
+        return (self.code == Reachability.OPEN).mean(axis=1)
 
     def palms(self, position: int) -> Array:
         """Return the palm poses (m, 4, 4) of a position."""
@@ -130,7 +130,7 @@ class ReachMap:
             "rotations": self.rotations,
             "shape": np.array(self.shape, dtype=np.int64),
             "code": self.code,
-            "verdicts": [verdict.name for verdict in Reach],
+            "verdicts": [verdict.name for verdict in Reachability],
         }
         if self.q is not None:
             arrays["q"] = self.q
@@ -302,9 +302,9 @@ def reach_map(
             decision = arm.decide(palms, tolerance)
             code[cells], witnesses = decision.code, decision.q
         if not is_exact:
-            undecided = np.flatnonzero(code[cells] == Reach.OPEN)
+            undecided = np.flatnonzero(code[cells] == Reachability.OPEN)
             solved, arms = _solve(solver, palms[undecided])
-            code[cells][undecided[solved]] = Reach.REACHABLE
+            code[cells][undecided[solved]] = Reachability.REACHABLE
             witnesses[undecided[solved]] = arms
         if q is not None:
             q[cells] = witnesses
