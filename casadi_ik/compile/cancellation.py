@@ -96,7 +96,8 @@ def interrupt_afterwards() -> Iterator[None]:
     evaluation for Ipopt as a failed evaluation.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed in the block (or what its handler raises).
+        KeyboardInterrupt: Ctrl-C was pressed in the block; a handler of the calling program may
+            raise another exception. Only the first delayed signal is raised again.
     """
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     if threading.current_thread() is not threading.main_thread():
@@ -120,7 +121,16 @@ SLICE = 0.2
 
 
 class DriverCode(IntEnum):
-    """Return values of runtime code (runtime/common.c)."""
+    """Return values of runtime code (runtime/common.c).
+
+    Attributes:
+        DONE: The job is done.
+        SLICE_OVER: `SLICE` is over; call again.
+        ROWS_FULL: The memory for logged rows is full; fetch the rows and call again.
+        CONTINUES: A further start of the solve is written.
+        FEW_LEFT: Too few solves are left to fill the lanes.
+        NO_MEMORY: Work memory could not be allocated.
+    """
 
     DONE = 0
     SLICE_OVER = 1
@@ -134,7 +144,7 @@ def run_cancellable(name: str, entry: Any, job: ctypes.Structure) -> None:
     """Call a runtime entry point until its job is done.
 
     Raises:
-        MemoryError: There is no work memory.
+        MemoryError: Work memory could not be allocated.
         CancelledError: The work of this thread is cancelled.
     """
     while (code := entry(ctypes.byref(job))) != DriverCode.DONE:
@@ -145,12 +155,12 @@ def check(name: str, code: int) -> None:
     """Raise unless the entry point can be called again.
 
     Raises:
-        MemoryError: There is no work memory.
+        MemoryError: Work memory could not be allocated.
         CancelledError: The work of this thread is cancelled.
     """
     stop_if_cancelled()
     if code == DriverCode.NO_MEMORY:
-        raise MemoryError(f"{name}: no work memory")
+        raise MemoryError(f"{name}: work memory could not be allocated")
 
 
 class ForkSafeLock:

@@ -59,7 +59,7 @@ def real_array(value: Any) -> Array:
         TypeError: The value cannot be converted.
     """
     if isinstance(value, np.ma.MaskedArray):
-        raise ValueError("array is masked (NaN marks free numbers)")
+        raise ValueError("array is masked; expected NaN for free numbers")
     array = np.array(value)
     if array.dtype.kind == "c":
         raise ValueError("array is complex")
@@ -96,10 +96,10 @@ def _length(vectors: Array) -> Array:
 
 
 EXTRA_VECTORS: Mapping[str, str] = {
-    "tangent": "where the contact frame's second axis must point, across the normal",
+    "tangent": "where the contact frame's second axis must point, orthogonal to the normal",
     "line": "the contact may be anywhere on the line through the point in this direction",
     "plane": "the contact may be anywhere on the plane through the point with this normal",
-    "ball": "the pad's ball touches the point where its outward normal is this one",
+    "ball": "the pad's ball touches the point with the spot whose outward normal is this vector",
 }
 """Vectors of a contact besides point and normal, by name; names of arrays add an s."""
 
@@ -290,8 +290,8 @@ class Grasp:
         posture: Hand posture by actuator that realises the contacts, if known [rad or m]; with a
             palm, the posture to take, with a number for every motor that moves a finger.
         palm: (4, 4) pose of the robot's palm frame in the base frame, with which only the arm is
-            solved for; for a multi-arm robot a mapping from side to pose, whose other hands do not
-            move. None: contacts determine the palm.
+            solved for; for a multi-arm robot a mapping from side to pose; hands of other sides do
+            not move. None: contacts determine the palm.
         pregrasp: Palm and posture before the hand closes, if known.
         squeeze: Palm and posture of the squeezing hand, if known.
 
@@ -326,7 +326,9 @@ class Grasp:
             if self.contacts:
                 raise InputError("palm: is given together with contacts; expected one of them")
             if not self.posture:
-                raise InputError("posture: missing; expected one for the hand of the palm")
+                raise InputError(
+                    "posture: missing; expected one, because the grasp has a palm pose"
+                )
         elif not self.contacts:
             raise InputError("contacts: found none, expected at least one finger, or a palm")
         for finger, contact in self.contacts.items():

@@ -82,7 +82,7 @@ class TouchingEntry(Struct, frozen=True):
     """Two links that may touch, with the reason.
 
     Attributes:
-        links: Names of the links; in a scene also of a solid.
+        links: Names of two links; in a scene one may be the name of a solid.
         reason: Reason in words.
         depth: Largest allowed penetration [m]; default: any.
     """
@@ -98,7 +98,7 @@ class CollisionEntry(Struct, frozen=True):
     Attributes:
         links: Shapes by link.
         touching: Pairs of links that are not checked, or whose penetration is allowed.
-        source: Tags of `sources` for the shapes.
+        source: Keys of `sources` in this file, separated by spaces, for the shapes.
         srdf: SRDF file with further pairs that may touch.
     """
 
@@ -109,15 +109,15 @@ class CollisionEntry(Struct, frozen=True):
 
 
 class JointEntry(Struct, frozen=True):
-    """A joint; without ``coupling`` it is its own actuator.
+    """A joint; without ``coupling`` a motor of its name drives it.
 
     Attributes:
-        name: Name of the joint; an actuator of a joint without coupling has the same name.
+        name: Name of the joint, and of its motor if it has no coupling.
         parent: Parent link.
         child: Child link.
         axis: Axis of rotation (prismatic: of translation) in the child's frame.
         limits: Lower and upper limit [rad or m].
-        source: Tags of `sources` for the numbers.
+        source: Keys of `sources` in this file, separated by spaces, for the numbers.
         type: revolute, prismatic or fixed.
         origin: Pose of the child's frame in the parent's at joint position zero.
         velocity: Velocity limit [rad/s or m/s]; default: unknown.
@@ -146,7 +146,7 @@ class ActuatorEntry(Struct, frozen=True):
         velocity: Velocity limit [rad/s or m/s]; default: that of the joint.
         effort: Largest torque or force [N m or N]; default: that of the joint.
         unit: rad or m, if no joint has this name.
-        source: Tags of `sources` for the numbers.
+        source: Keys of `sources` in this file, separated by spaces, for the numbers.
     """
 
     limits: tuple[JointValue, JointValue] | None = None
@@ -163,7 +163,7 @@ class LinkFrame(Frame, frozen=True, kw_only=True):
         link: Name of the link.
         xyz: Origin in the link's frame [m].
         rpy: Angles about the fixed axes x, y, z [rad], as in URDF.
-        source: Tags of `sources` for the numbers.
+        source: Keys of `sources` in this file, separated by spaces, for the numbers.
     """
 
     link: str
@@ -174,8 +174,8 @@ class BallPad(Struct, frozen=True, tag_field="kind", tag="ball"):
     """A pad that touches with any point of a ball, nominally with the contact frame's origin.
 
     Attributes:
-        radius: Radius of the ball, which touches the contact frame's origin from inside the pad
-            [m].
+        radius: Radius of the ball [m]. Its surface passes through the contact point, and its
+            centre is a radius behind that point, inside the pad.
     """
 
     radius: Size
@@ -188,14 +188,16 @@ class PlanePad(Struct, frozen=True, tag_field="kind", tag="plane"):
 class PadEntry(Frame, frozen=True, kw_only=True):
     """The contact frame of a finger: contact point and orientation of its pad.
 
-    The tangent is made orthogonal to the normal.
+    The entry states a frame on the link, and normal and tangent of the pad in that frame. The
+    contact frame has the same origin; its axes are normal, tangent and their cross product. The
+    tangent is made orthogonal to the normal.
 
     Attributes:
         link: Link of the pad.
-        normal: Direction out of the pad, away from the finger, in the contact frame.
+        normal: Direction out of the pad, away from the finger, in the stated frame.
         xyz: Contact point in the link's frame [m].
-        rpy: Angles of the contact frame about the link's fixed axes [rad].
-        tangent: Second axis of the pad; default: the frame's x axis.
+        rpy: Angles of the stated frame about the link's fixed axes [rad].
+        tangent: Second axis of the pad in the stated frame; default: its x axis.
         pad: Shape of the pad; default: a plane.
     """
 
@@ -206,10 +208,10 @@ class PadEntry(Frame, frozen=True, kw_only=True):
 
 
 class FingertipEntry(PadEntry, frozen=True, kw_only=True):
-    """The contact frame of a finger of a described hand; see `PadEntry`.
+    """The contact frame of a finger of a hand described in YAML; see `PadEntry`.
 
     Attributes:
-        source: Tags of `sources` for the numbers.
+        source: Keys of `sources` in this file, separated by spaces, for the numbers.
     """
 
     source: str
@@ -222,7 +224,8 @@ class _Description(Struct, frozen=True, kw_only=True):
         name: Name.
         description: Description; the first sentence is a summary.
         home: Home position by actuator [rad or m].
-        collision: Shapes of the links; these override those of its parts, or of its file.
+        collision: Shapes of the links; they override those of the arm and hand files, or those of
+            the imported file.
         sources: Sources of numbers by tag.
     """
 
@@ -258,14 +261,14 @@ class ArmFile(_PartFile, frozen=True, kw_only=True):
 class HandFile(_PartFile, frozen=True, kw_only=True):
     """A hand: ``models/hands/*.yaml``.
 
-    ``thumb``, ``mount`` and ``home`` apply to robots that are named ARM+HAND; other robots state
-    their own.
+    ``thumb``, ``mount`` and ``home`` apply to robots that are loaded as ARM+HAND; robots with a
+    file of their own state these keys there.
 
     Attributes:
         palm: Frame of the palm: z away from it, y towards the thumb.
         fingers: Contact frame by finger.
         actuators: Motors by name; default: one for each joint without coupling.
-        thumb: Finger that is placed first.
+        thumb: Finger whose contact thumb-first methods solve first.
         mount: Pose of the hand's root on an arm's tip.
     """
 
@@ -325,9 +328,9 @@ class _SingleHandRobot(_Robot, frozen=True, kw_only=True):
     """A robot with one hand, on an arm or on a fixed base.
 
     Attributes:
-        thumb: Finger that is placed first; thumb-first methods need one.
-        arm: Shipped name, path, or arm in a URDF or MJCF file; default: the hand is on a fixed
-            base.
+        thumb: Finger whose contact thumb-first methods solve first; they need one.
+        arm: Name of a model in the package, path, or arm in a URDF or MJCF file; default: the hand
+            is on a fixed base.
         mount: Pose of the hand's root on the arm's tip.
     """
 
@@ -337,10 +340,10 @@ class _SingleHandRobot(_Robot, frozen=True, kw_only=True):
 
 
 class ArmHandFile(_SingleHandRobot, frozen=True, kw_only=True):
-    """A robot: an arm (or none), a described hand, and the mount between them.
+    """A robot: an arm (or none), a hand described in YAML, and the mount between them.
 
     Attributes:
-        hand: Shipped name, path, or the description of the hand.
+        hand: Name of a model in the package, path, or the description of the hand.
         fingers: Fingers of the hand that are used, in order.
     """
 
@@ -349,7 +352,9 @@ class ArmHandFile(_SingleHandRobot, frozen=True, kw_only=True):
 
 
 class ImportedFile(_SingleHandRobot, frozen=True, kw_only=True):
-    """A robot whose hand is in a URDF or MJCF file: ``hand``, or ``robot`` with its arm.
+    """A robot whose hand is in a URDF or MJCF file.
+
+    It states ``hand`` for a file with a hand only, or ``robot`` for a file with arm and hand.
 
     Attributes:
         fingers: Contact frame by finger, which URDF and MJCF do not state.
@@ -366,15 +371,15 @@ class PartSide(Struct, frozen=True):
     """A side of a multi-arm robot that is composed of parts.
 
     Attributes:
-        arm: Shipped name, path, or arm in a URDF or MJCF file.
-        hand: Shipped name, path, or the description of the hand; default: the hand after the plus
-            sign of the robot's name.
+        arm: Name of a model in the package, path, or arm in a URDF or MJCF file.
+        hand: Name of a model in the package, path, or the description of the hand; default: the
+            hand after the plus sign of the robot's name.
         at: Pose of the arm's root on the trunk's end; omitted by all sides if their arms share a
             root link.
         mount: Pose of the hand's root on the arm's tip; default: that of the hand.
         mirror: Parts ("arm", "hand") that are mirror images of the description, left for right.
         fingers: Fingers of the hand that are used; default: all.
-        thumb: Finger that is placed first; default: that of the hand.
+        thumb: Finger whose contact thumb-first methods solve first; default: that of the hand.
     """
 
     arm: str | ArmFromFile
@@ -409,7 +414,7 @@ class FileSide(Struct, frozen=True):
     Attributes:
         palm: Link of its palm, or a frame on it; the hand is everything below.
         fingers: Contact frame by finger, which URDF and MJCF do not state.
-        thumb: Finger that is placed first.
+        thumb: Finger whose contact thumb-first methods solve first.
     """
 
     palm: str | LinkFrame

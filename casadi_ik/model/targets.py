@@ -15,7 +15,8 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import Tolerance, real_array, unit_vectors
 
 LIMIT_MODES = ("enforce", "ignore")
-"""Treatment of joint limits: part of success, or ignored as in the paper."""
+"""Treatment of joint limits. "enforce": a solution is within them; "ignore": they do not matter, as
+in Qiu & Kermani 2021."""
 
 Q0, CLEARANCE, MANIPULABILITY = "q0", "clearance", "manipulability"
 
@@ -101,8 +102,8 @@ class TargetBatch:
         """Return some of the targets.
 
         Args:
-            rows: A slice without a step keeps the targets' numbers; targets of an index array are
-                numbered from 0.
+            rows: A slice without a step keeps the numbers of the targets. With an index array
+                targets are numbered from 0, unless the batch has `row_numbers`.
         """
         first_row = 0
         if isinstance(rows, slice):
@@ -198,7 +199,7 @@ class TargetBatch:
         return q0[None] if len(self) == 1 else np.repeat(q0[None], len(self), axis=0)
 
     def bounds(self, robot: RobotDescription, unbounded: float = 1e3) -> tuple[Array, Array]:
-        """Return the bounds that a method enforces: limits, or else ranges of mechanisms.
+        """Return the bounds that a method enforces: limits, or mechanical ranges without limits.
 
         The bounds are (n,), or (k, n) if targets fix actuators at different positions.
 
@@ -269,8 +270,8 @@ def target_arrays(
         normals: (k, f, 3) of any length but zero.
         f: Number of the robot's fingers.
         first_row: Number of the first row, for messages.
-        directions: (k, f, 3) pad normals of fingertips that may be anywhere, of any length but
-            zero; NaN, or None for all, if there is none.
+        directions: (k, f, 3) nonzero pad normals of fingertips whose position is free; NaN for
+            other fingertips. None: no directions.
 
     Returns:
         Points and unit normals, (k, f, 3); a direction is a normal without a point.
@@ -312,7 +313,7 @@ def target_arrays(
     _refuse(zero, first_row, "normals", "is zero, expected a direction")
     free_point = np.isnan(p[..., 0])
     without_point = free_point & ~np.isnan(n[..., 0])
-    _refuse(without_point, first_row, "normals", "is given for a finger without a point")
+    _refuse(without_point, first_row, "normals", "has a normal but no point")
     if direction_arrays:
         unit_directions, zero = unit_vectors(direction_arrays[0])
         _refuse(zero, first_row, DIRECTIONS_KEY, "is zero, expected a direction")

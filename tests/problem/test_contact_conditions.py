@@ -151,7 +151,7 @@ def test_newton_rows_match_differences_at_the_target(robot, kind, rng):
 
     assert np.abs(errors(q)).max() < 1e-7
     linear = linearise_contacts(robot.description, rows, ca.SX(q), p)
-    jacobian = np.vstack([number(linear.thumb), number(linear.others)])
+    jacobian = np.vstack([number(linear.thumb), number(linear.other_fingers)])
     slopes = -differences(errors, q)
     np.testing.assert_allclose(jacobian.T @ jacobian, slopes.T @ slopes, atol=1e-5, rtol=1e-5)
 
@@ -235,7 +235,7 @@ def test_frame_without_tangent_is_a_normal(robot, rng):
     error, expected_error = (
         linearise_contacts(robot.description, rows, ca.SX(q), p) for rows in (frame, normal)
     )
-    gram = [np.vstack([number(x.thumb), number(x.others)]) for x in (error, expected_error)]
+    gram = [np.vstack([number(x.thumb), number(x.other_fingers)]) for x in (error, expected_error)]
     np.testing.assert_allclose(gram[0].T @ gram[0], gram[1].T @ gram[1], atol=1e-9)
 
 

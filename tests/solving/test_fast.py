@@ -61,7 +61,7 @@ def test_one_instance_per_thread(robot, targets):
         (lambda p, n: (p * np.inf, n), "is infinite"),
         (lambda p, n: (p + 0j, n), "is complex"),
         (lambda p, n: ([[0.5], [0.5, 0.1]], n), "points: expected an array of numbers"),
-        (lambda p, n: (p * np.nan, n), "without a point"),
+        (lambda p, n: (p * np.nan, n), "no point"),
         (lambda p, n: (p * [1, np.nan, 1], n), "partly NaN"),
         (lambda p, n: (p * np.nan, n * np.nan), "row 0 has no contact"),
     ],

@@ -257,7 +257,7 @@ def problem(robot):
     normals, weights = ca.SX.sym("normals", 3, 3), ca.SX.sym("weights", 3, 2)
     p = {"points": points, "normals": normals, "weights": weights}
     linear = linearise_contacts(robot.description, ROWS, q, p)
-    outputs = [linear.thumb, linear.thumb_error, linear.others, linear.others_error]
+    outputs = [linear.thumb, linear.thumb_error, linear.other_fingers, linear.other_fingers_error]
     return ca.Function("problem", [q, points, normals, weights], outputs)
 
 

@@ -201,7 +201,11 @@ def turn(axis: int, angle: float) -> np.ndarray:
 
 def contact(finger, q) -> tuple[np.ndarray, np.ndarray]:
     """Contact point and normal in the palm frame from the constants alone."""
-    spread = 0.0 if finger.spread is None else finger.ratio * q[finger.spread] + finger.offset
+    spread = (
+        0.0
+        if finger.spread_motor is None
+        else finger.ratio * q[finger.spread_motor] + finger.offset
+    )
     first, second = q[list(finger.flexion)]
     bent = finger.proximal + turn(1, first) @ (finger.middle + turn(1, second) @ finger.tip)
     angle = finger.normal_angle + first + second

@@ -68,7 +68,11 @@ def _run(words: Sequence[str]) -> int:
 
 
 class Terminated(KeyboardInterrupt):
-    """Exception raised on SIGTERM; handlers of Ctrl-C clean up files for it, too."""
+    """Exception raised on SIGTERM.
+
+    It is a KeyboardInterrupt, so that code that removes its files on Ctrl-C also does so on
+    SIGTERM.
+    """
 
 
 class _Signals:
@@ -108,7 +112,8 @@ class _Signals:
     def __exit__(self, *_: object) -> None:
         if self._delayed is not None:
             self._delayed.cancel()
-        # Python restores the default handlers before the process ends: a late signal would kill it.
+        # Python restores the default handlers before the process ends; a signal after that would
+        # change the exit code, so signals are ignored from here on.
         is_ignored = self.is_finished and self._whole_process
         for number in self._handled:
             default = self.DEFAULT_HANDLERS[number]

@@ -89,10 +89,11 @@ def reach_map(args: Arguments) -> CommandResult:
     opt.picture("--picture", "heat map of the bases"),
 )
 def place_base(args: Arguments) -> CommandResult:
-    """Place an upright base so that the arm reaches most palm poses.
+    r"""Place an upright base so that the arm reaches most palm poses.
 
     Examples:
-      casadi-ik place-base palms.npz --robot ur5e --region -1 -1 0 1 1 0 --out place.json
+      casadi-ik place-base palms.npz --robot ur5e --region -1 -1 0 1 1 0 \
+          --out place.json
 
     The search is a branch and bound: the report has the number of palm poses that the
     best base reaches, and a proved upper bound for all bases of the region. Collisions

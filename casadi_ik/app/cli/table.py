@@ -218,7 +218,10 @@ def usage(name: str, loaded: Command) -> str:
     """Return the usage line with the required arguments of a command."""
     words = [item.syntax for item in loaded.options if item.required or not item.is_named]
     optional = ["[OPTIONS]"] if any(item.is_named for item in loaded.options) else []
-    return " ".join([PROGRAM, name, *words, *optional])
+    line = " ".join([PROGRAM, name, *words, *optional])
+    return textwrap.fill(
+        line, WIDTH - len("usage: "), subsequent_indent="  ", break_on_hyphens=False
+    )
 
 
 def _wrap(text: str) -> str:

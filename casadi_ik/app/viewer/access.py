@@ -57,7 +57,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 """Hosts at which only this machine can open a page."""
 
 _PATCH_LOCK = threading.Lock()
-"""Lock held while viser's function to serve is patched."""
+"""Lock held while `websockets.asyncio.server.serve`, which viser calls, is patched."""
 
 
 @dataclass
@@ -111,8 +111,8 @@ def _is_address(name: str) -> bool:
 
 
 @contextlib.contextmanager
-def authorised_server(access: Access) -> Iterator[threading.Event]:
-    """Patch viser to authorise every request and drop malformed messages silently.
+def checked_server(access: Access) -> Iterator[threading.Event]:
+    """Patch viser so that every request is checked, and clients and messages are validated.
 
     Yields:
         Event that is set once the access control is installed.
@@ -121,10 +121,8 @@ def authorised_server(access: Access) -> Iterator[threading.Event]:
 
     def serve(handler: Handler, *arguments: Any, **options: Any) -> Any:
         installed.set()
-        options["process_request"] = _authorising(access, options.get("process_request"))
-        return original_serve(
-            _drop_malformed_messages(handler), *arguments, **options, logger=connection_logger
-        )
+        options["process_request"] = _checking(access, options.get("process_request"))
+        return original_serve(_validating(handler), *arguments, **options, logger=connection_logger)
 
     # viser warns about every browser that disconnects early.
     warnings.filterwarnings("ignore", r"\[viser\]|Queued a ")
@@ -137,7 +135,7 @@ def authorised_server(access: Access) -> Iterator[threading.Event]:
             websocket_server.serve = original_serve  # type: ignore[misc]
 
 
-def _authorising(access: Access, process: Any) -> Any:
+def _checking(access: Access, process: Any) -> Any:
     def process_request(connection: ServerConnection, request: Request) -> Response | None:
         try:
             refusal = access.refusal(request)
@@ -148,6 +146,7 @@ def _authorising(access: Access, process: Any) -> Any:
         path = request.path.removeprefix(f"/{access.token}") if access.token else request.path
         if path.split("?")[0] not in ("", "/"):
             return process(connection, Request(path, request.headers))
+        # The body is changed below, so it must not be compressed.
         headers = ((k, v) for k, v in request.headers.raw_items() if k.lower() != "accept-encoding")
         return _set_page_title(
             process(connection, Request(path or "/", Headers(headers))), access.title
@@ -177,8 +176,11 @@ def _set_page_title(page: Response | None, title: str) -> Response | None:
     return page
 
 
-def _drop_malformed_messages(handler: Handler) -> Handler:
-    """Wrap a handler so that foreign clients and malformed messages are not reported."""
+def _validating(handler: Handler) -> Handler:
+    """Wrap a handler: close connections of other clients, and refuse invalid messages.
+
+    Both are logged at debug level only.
+    """
 
     def log_exception(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         logger.debug("%s", context.get("message"), exc_info=context.get("exception"))
@@ -278,7 +280,7 @@ class Viewer:
             >>> viewer.stop()
         """
         selection = self.page.selection
-        self.page.select("")  # a page without a server cannot be dragged
+        self.page.select("")  # drag handles of a selection need a server
         self.page.work.settle()
         text = self._server.scene.as_html(dark_mode=dark)
         self.page.select(selection)
@@ -319,7 +321,7 @@ def serve(host: str = HOST, port: int | None = None, secret: bool = False) -> Se
         ports_text = f"{port}" if port is not None else f"{PORT} to {PORT + 99}"
         raise InputError(f"port: {ports_text} is in use on {host}; expected a free port")
     access = Access(host, secrets.token_urlsafe(16) if secret else "")
-    with authorised_server(access) as installed, contextlib.redirect_stdout(io.StringIO()):
+    with checked_server(access) as installed, contextlib.redirect_stdout(io.StringIO()):
         server = Server(host=host, port=free, verbose=False)
     if not installed.is_set():
         server.stop()

@@ -1,12 +1,15 @@
 /* Search for the preferred collision-free arms at given palm poses.
  *
- * All arms in closed form, at given samples of the redundancy (swivel angle, swept joint), are
- * sorted by the preference and checked in the lanes until an arm is
- * collision-free. The redundancy is then refined around that sample, on the same branch. If no arm
- * is collision-free, a second level of samples is tried before the hand is given up.
+ * An arm is one configuration of the arm's joints; a hand is one row of the input: a palm pose with
+ * a hand posture. All arms in closed form, at given samples of the redundancy (swivel angle, swept
+ * joint), are sorted by the preference, and `lanes` of them at a time are checked for collisions
+ * until one is free. The redundancy is then refined around that sample, on the same branch. If no
+ * arm is collision-free, a second level of samples is tried before the next hand.
  *
- * The compiled kernels are called through pointers. A freestanding solver (FREESTANDING) defines
- * calls and memory: KERNEL, CALL, ROOM, GIVE_BACK, OWN_MEMORY.
+ * The compiled kernels are called through pointers. The file is compiled after the code that
+ * declares `scalar`, `map_job` and `clearance_job`. A freestanding solver (FREESTANDING) defines
+ * how kernels are declared and called (KERNEL, CALL), how zeroed memory is allocated and released
+ * (ROOM, GIVE_BACK), and the member of a job that points to its static memory (OWN_MEMORY).
  */
 #include <math.h>
 #include <stdint.h>
@@ -27,37 +30,45 @@ enum { DONE = 0, SLICE_OVER = 1, NO_MEMORY = -1 };
 #define OWN_MEMORY
 #endif
 
+/* Preferences, the values of `order`. */
 enum { FAR_FROM_LIMITS, NEAR_START, MEASURED, CLEAREST };
+/* Numbers of a palm pose in the input of `arms`: rotation and origin. */
 enum { PALM = 12, LEVELS = 2 };
 
 #define FULL_TURN (scalar) 6.283185307179586
 
 typedef struct {
-  KERNEL(arms, map_job);       /* rotation, origin, redundancy -> arms of branches, reach margins */
+  KERNEL(arms, map_job);       /* rotation, origin, redundancy -> n_rows arms, a branch each,
+                                  and their reach margins; negative: no arm */
   KERNEL(measure, map_job);    /* q -> score, higher is better; for MEASURED */
   KERNEL(check, clearance_job);
   clearance_job *clearance;    /* pairs to check; NULL: none */
   int64_t lanes;               /* number of configurations that are checked together */
-  int64_t order;
+  int64_t order;               /* preference */
   int64_t n_q, n_arm, n_redundancy, n_rows;
-  int64_t n_groups;            /* 1: a single arm; else one of every branch, and the given arm */
+  int64_t n_groups;            /* 1: return the best arm; n_rows + 1: the best arm of every
+                                  branch, and the arm in q as a group of its own */
   int64_t n_samples[LEVELS], n_offsets;
   const scalar *samples[LEVELS]; /* rows of n_redundancy; a refinement varies the last column */
   const scalar *offsets;       /* of the refinement around the chosen sample */
   const int64_t *columns;      /* of the arm in q */
-  const scalar *lower, *upper; /* bounds of the arm */
-  const scalar *low, *range;   /* limits of the arm, which define its limit margin */
+  const scalar *lower, *upper; /* bounds of the arm, which are enforced */
+  const scalar *low, *range;   /* joint limits of the arm, used in scores only */
   const scalar *q, *palms, *starts; /* rows of n_q, 16 and n_q */
-  const int64_t *owner;        /* of each hand, in contiguous groups: after the first hand with an
-                                  arm the other hands of its owner are skipped; NULL: no skipping */
+  const int64_t *owner;        /* number of the target of each hand; the hands of a target are
+                                  contiguous, and after its first hand with an arm the rest are
+                                  skipped; NULL: no hand is skipped */
   const scalar *clearance_bounds; /* of each hand: upper bound of the clearance of its arms */
-  const scalar *poses;
-  int64_t pose_step;           /* distance between consecutive hands; 0: shared by all hands */
+  const scalar *poses;         /* poses of the movable solids of the scene */
+  int64_t pose_step;           /* numbers from the poses of a hand to those of the next;
+                                  0: all hands share them */
   scalar margin, rounding;     /* required clearance, and the allowed rounding error below it */
-  scalar min_limit_margin;     /* distance of a joint from its bounds; negative: rounding error */
+  scalar min_limit_margin;     /* smallest distance of a joint from its bounds; a negative one
+                                  allows for rounding errors */
   int64_t count;
   scalar *best_arms;            /* rows of n_groups arms */
-  scalar *score;               /* rows of n_groups: score of the arm alone; -inf: no arm */
+  scalar *score;               /* rows of n_groups: score; -inf: no arm. With CLEAREST it is the
+                                  clearance minus `margin` */
   int64_t *arms_tried;             /* number of arms within bounds */
   OWN_MEMORY
 } arm_search_job;
@@ -66,7 +77,8 @@ typedef struct {
 typedef struct {
   int64_t count;
   scalar *arms, *score;
-  int64_t *arm, *sample, *group; /* offset in `arms`, row of the samples, branch */
+  int64_t *arm, *sample, *group; /* offset in `arms`, row of the samples, branch or the group
+                                  of the given arm */
   char *used;
 } pool;
 
@@ -87,6 +99,7 @@ static int64_t max_arms(const arm_search_job *job) {
                                                        : max_pool_size(job, 1);
 }
 
+/* Return the bytes of the scratch memory: the sum of the sizes in lay_out. */
 static size_t scratch_size(const arm_search_job *job) {
   const int64_t width = job->n_arm + 1, most = max_arms(job);
   const int64_t integers = 6 * most + 2 * job->lanes;
@@ -137,15 +150,16 @@ static int run_map(const arm_search_job *job, KERNEL(kernel, map_job), const sca
   map.outputs = outputs;
   map.output_steps = &out_width;
   map.count = count;
-  map.slice = 1;
-  (void) job;
+  map.slice = 1; /* s */
+  (void) job; /* CALL of a freestanding solver uses it */
   do code = CALL(kernel, &map);
   while (code == SLICE_OVER);
   return code;
 }
 
-/* Shift an arm by full turns into its bounds: fixed joints to their position, others near the start
- * if that is the preference. Returns 0 if the arm is outside its bounds by more than rounding. */
+/* Shift fixed joints by full turns to their position and, with NEAR_START, the others towards the
+ * start; then clamp the arm to its bounds. Returns 0 if a joint is outside its bounds by more than
+ * rounding. */
 static int clamp_and_check(const arm_search_job *job, scalar *arm, const scalar *start) {
   int64_t j;
   for (j = 0; j < job->n_arm; ++j) {
@@ -290,7 +304,7 @@ static int best_free_arm(const arm_search_job *job, scratch *space, int64_t hand
     if (code != DONE) return code;
     for (n = 0; n < count; ++n) {
       scalar surplus = space->least[n] - job->margin;
-      /* Arms that reach the bound of their hand are equal: the first one by limit margin wins. */
+      /* Clearances at the bound of their hand are equal: the larger limit margin wins. */
       if (clearest && surplus > job->clearance_bounds[hand]) {
         surplus = job->clearance_bounds[hand];
       }

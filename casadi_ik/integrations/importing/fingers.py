@@ -16,7 +16,11 @@ FINGER_PATTERNS = {
     "little": r"little|pinky|(?<![a-z])lf(?=j|dist|prox|mid|knuck|meta|tip|_|$)",
     "middle": r"middle_?finger|(?<![a-z])mf(?=j|dist|prox|mid|knuck|tip|_|$)|middle",
 }
-"""Patterns of finger names; a middle phalanx must not turn a finger into the middle finger."""
+"""Patterns of finger names; a middle phalanx must not turn a finger into the middle finger.
+
+The abbreviations are those of Shadow hands: th, ff, mf, rf and lf are thumb, first (index), middle,
+ring and little finger.
+"""
 
 
 @dataclass(frozen=True)
@@ -43,10 +47,15 @@ def find_fingers(part: RobotPart, palm: str) -> list[FingerChain]:
     fingers: list[FingerChain] = []
     for joint in moving_below(part, palm):
         for start, end in _finger_ends(part, joint):
-            links = [start.child, *(below.child for below in joints_below(part, start.child))]
-            joint_names = [below.name for below in part.joints if below.child in links]
+            links = [
+                start.child,
+                *(joint_below.child for joint_below in joints_below(part, start.child)),
+            ]
+            joint_names = [
+                link_joint.name for link_joint in part.joints if link_joint.child in links
+            ]
             word = _finger_word([*links, *joint_names])
-            chain = [below for below in chain_to(part, end.child, palm) if below.type != "fixed"]
+            chain = [item for item in chain_to(part, end.child, palm) if item.type != "fixed"]
             tip = _tip_link(part, end.child)
             fingers.append(FingerChain(word or "", tuple(chain), tip, tuple(links), bool(word)))
     return _with_unique_names(fingers)
@@ -55,8 +64,8 @@ def find_fingers(part: RobotPart, palm: str) -> list[FingerChain]:
 def _finger_ends(part: RobotPart, joint: Joint) -> list[tuple[Joint, Joint]]:
     """Return the first and last joint of each finger that a joint carries.
 
-    Two chains of two or more joints on one joint are two fingers; of shorter chains (linkages) the
-    longest counts.
+    If a joint carries at least two chains of two or more joints, each chain is a finger. Otherwise
+    only the longest chain is followed; the others belong to linkages.
     """
     next_joints = moving_below(part, joint.child)
     chains = [next_joint for next_joint in next_joints if joint_depth(part, next_joint.child) >= 1]
@@ -84,7 +93,8 @@ def _finger_word(names: list[str]) -> str | None:
         word: sum(bool(re.search(pattern, name)) for name in lower)
         for word, pattern in FINGER_PATTERNS.items()
     }
-    best = max(counts, key=lambda word: counts[word])  # the first of equals: middle is the last
+    # "middle" also names phalanges: it wins only if it is in most names and the best word is not.
+    best = max(counts, key=lambda word: counts[word])  # the first of equals
     if counts["middle"] and best != "middle" and counts[best] < len(lower) / 2 < counts["middle"]:
         best = "middle"
     return best if counts[best] else None

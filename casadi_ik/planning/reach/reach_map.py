@@ -47,7 +47,8 @@ class ReachMap:
         rotations: (m, 3, 3) orientations of the palm; (g, 3, 3) without a grid.
         shape: Numbers of positions along x, y and z; empty without a grid.
         code: (g, m) verdicts, see `Reachability`; (g, 1) without a grid.
-        q: (g, m, a) witnesses of the arm [rad], NaN unless REACHABLE; None if they are not kept.
+        q: (g, m, a) arm positions that reach the palm pose [rad] (witnesses), NaN unless
+            REACHABLE; None if they are not kept.
 
     Example:
         >>> reach = solver.reach_map(([0.3, -0.2, 0.3], [0.7, 0.2, 0.5]), orientations=8)
@@ -161,7 +162,9 @@ class ReachMap:
             raise InputError(f"{path}: is not a map: {error}; expected a file of `save`") from error
 
     def to_parquet(self, path: str | PathLike[str]) -> None:
-        """Write a table with a row per palm pose: position, quaternion, verdict, witness.
+        """Write a table with a row per palm pose.
+
+        The columns are position, rotation matrix (r00 to r22), verdict and witness.
 
         Raises:
             MissingExtraError: Polars is not installed.
@@ -233,8 +236,9 @@ def reach_map(
 ) -> ReachMap:
     """Return a map of the palm poses that the arm can reach.
 
-    Every cell is REACHABLE with a witness that is checked by forward kinematics, UNREACHABLE by
-    interval bounds that are rounded outward, or OPEN. Collisions are not considered.
+    Every palm pose is REACHABLE (arm positions are found and checked by forward kinematics),
+    UNREACHABLE (proved by interval bounds that are rounded outward) or OPEN (neither). Collisions
+    are not considered.
 
     Args:
         solver: A `Solver`.
@@ -243,10 +247,10 @@ def reach_map(
         orientations: Number of orientations, which are spread evenly over all rotations; or
             rotations (m, 3, 3). Ignored for palm poses.
         resolution: Largest distance between neighbouring positions [m].
-        meaning: "exact": the cell is the palm pose itself, within 1e-10. "within tolerance": the
-            cell is what the solver accepts; cells that intervals leave undecided are solved.
-            None: "exact" for an arm with an exact closed form. For other arms the map has only
-            witnesses within tolerance that the solver finds, and OPEN cells.
+        meaning: "exact": verdicts hold for the palm pose itself, within 1e-10. "within tolerance":
+            verdicts hold for poses within the tolerance of the solver, which is tried where the
+            intervals decide nothing. None: "exact" for an arm with an exact closed form; for other
+            arms "within tolerance, sampled": the solver is tried, and nothing is UNREACHABLE.
         keep_q: Whether to keep the witnesses.
         jobs: Number of threads.
         max_memory: Largest memory of the map [bytes].
@@ -280,11 +284,11 @@ def reach_map(
         )
     if region is None:
         region = reachable_box(robot)
-    size = len(description.arm_actuators) if keep_q else 0
-    positions, rotations, shape = _cells(region, orientations, resolution, size, max_memory)
+    kept_joints = len(description.arm_actuators) if keep_q else 0
+    positions, rotations, shape = _cells(region, orientations, resolution, kept_joints, max_memory)
     count = len(rotations) if shape else 1
     code = np.zeros(len(positions) * count, dtype=np.int8)
-    q = np.full((len(code), size), np.nan) if keep_q else None
+    q = np.full((len(code), kept_joints), np.nan) if keep_q else None
     is_exact = family is not None and meaning != Meaning.WITHIN_TOLERANCE
     enforce_limits = solver.limits == "enforce"
     arm = None
@@ -373,13 +377,13 @@ def _cells(
     region: ArrayLike,
     orientations: int | ArrayLike,
     resolution: float,
-    size: int,
+    kept_joints: int,
     max_memory: float,
 ) -> tuple[Array, Array, tuple[int, ...]]:
     """Return positions, rotations and the shape of the grid, which is empty for palm poses."""
     if np.ndim(region) == 3 or (np.ndim(region) == 2 and np.shape(region) == (4, 4)):
         palms = checked_pose(region, "region").reshape(-1, 4, 4)
-        _check_memory(len(palms), size, max_memory, "region")
+        _check_memory(len(palms), kept_joints, max_memory, "region")
         return palms[:, :3, 3].copy(), palms[:, :3, :3].copy(), ()
     corners = box_region(region)
     if not isinstance(resolution, int | float) or not 0 < resolution < np.inf:
@@ -396,20 +400,20 @@ def _cells(
             )
         rotations = checked_rotations(matrices, "orientations")
     counts = np.ceil((corners[1] - corners[0]) / resolution - 1e-9) + 1
-    _check_memory(float(counts.prod()) * len(rotations), size, max_memory, "resolution")
+    _check_memory(float(counts.prod()) * len(rotations), kept_joints, max_memory, "resolution")
     shape = tuple(int(count) for count in counts)
     axes = [np.linspace(low, high, count) for low, high, count in zip(*corners, shape, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     return grid, rotations, shape
 
 
-def _check_memory(cells: float, size: int, max_memory: float, name: str) -> None:
-    memory = cells * (1 + 8 * size)
+def _check_memory(cells: float, kept_joints: int, max_memory: float, name: str) -> None:
+    memory = cells * (1 + 8 * kept_joints)  # a byte for a verdict, eight for a joint position
     if memory > max_memory:
         raise InputError(
             f"{name}: {cells:.3g} palm poses take {memory / 1e9:.3g} GB, expected at most "
             f"{max_memory / 1e9:.3g} GB (max_memory); a coarser resolution, fewer orientations"
-            f"{' or keep_q=False' if size else ''} takes less"
+            f"{' or keep_q=False' if kept_joints else ''} takes less"
         )
 
 
@@ -425,7 +429,7 @@ def _poses(positions: Array, rotations: Array, shape: tuple[int, ...], rows: sli
 
 
 def _palm_tolerance(solver: Any) -> Tolerance:
-    """Return the tolerance of palm poses: the largest of the fingers."""
+    """Return the largest tolerance of any finger, which palm poses have."""
     tolerances = list(solver.tolerances.values()) or [Tolerance()]
     return Tolerance(
         max(item.position for item in tolerances), max(item.angle for item in tolerances)

@@ -1,4 +1,9 @@
-"""State, parameters and record of the hand-first method, and the start of a restart."""
+"""State, parameters and record of the hand-first method, and the start of a restart.
+
+Hand-first fits palm and hand to the contacts as if the hand were floating, lets the arm carry the
+palm there, and refines all motors where the arm cannot follow exactly. `Stage` lists the steps;
+`iteration.c`, `one_arm.c` and `multi_arm.c` choose the next one, `step.py` builds their graphs.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +47,25 @@ COUNTED_PHASES = (
 
 
 class Stage(IntEnum):
-    """Stage of the next iteration; a stage that is a phase in logs has the code of the phase."""
+    """Stage of the next iteration.
+
+    Several stages can be logged as one `Phase`; a stage that is logged as itself has the code of
+    its phase. A tolerant stage continues a fit whose minimum misses the contacts, with errors
+    within tolerance at no cost.
+
+    Attributes:
+        START: Evaluates q0 if it is preferred.
+        REFINEMENT: Damped steps of all motors.
+        CANDIDATE: Takes the next hand posture and computes its best palm pose.
+        HAND_FIT: Damped steps of palm and hand.
+        ARM_PLACEMENT: Arm in closed form for the palm pose.
+        BALANCE: Steps of all motors that reduce the largest relative error.
+        ARM_CHOICE: Arm in closed form nearest to q0, or farthest from its limits.
+        TRUNK: Damped steps of trunk and arms of a multi-arm robot.
+        ARM_STEPS: Damped steps of an arm without closed form.
+        TOLERANT_HAND_FIT: Tolerant steps of palm and hand.
+        TOLERANT_REFINEMENT: Tolerant steps of all motors.
+    """
 
     START = 0
     REFINEMENT = Phase.REFINEMENT
@@ -66,11 +89,11 @@ STAGE_RESULT = Layout(
         Field("is_settled", doc="1 if the fit, the steps or the balance have ended"),
         Field("is_within", doc="1 if all contacts are within tolerance"),
         Field("is_idle", doc="candidate: 1 if no finger of the side has a contact"),
-        Field("arm_is_allowed", doc="1 if the best arm is within its limits, or near enough to q0"),
+        Field("arm_is_allowed", doc="1 if the best arm is within limits, or near q0 if preferred"),
         Field("arm_is_exact", doc="1 if the arm of this trial meets the palm pose"),
-        Field("arm_is_close", doc="1 if an arm of few motors is as close as the tolerance asks"),
+        Field("arm_is_close", doc="1 if an arm of few motors is within tolerance of the palm"),
         Field("rms_ratio", doc="root mean square of the errors of a fit, relative to tolerances"),
-        Field("cost", doc="cost before a hand fit, or of steps of an arm or a trunk"),
+        Field("cost", doc="hand fit: cost before it; arm or trunk steps: their cost"),
         Field("max_ratio", doc="balance: largest error relative to its tolerance"),
         Field("joint_to_flip", doc="arm joint, from 1, to move to its opposite limit; 0: none"),
     )
@@ -92,7 +115,7 @@ STEP_FIELDS = (
     Field("growth", doc="factor of the damping if the next step is rejected"),
     Field("cost", doc="cost at q, or at palm and hand in a hand fit"),
     Field("slow_steps", doc="number of consecutive steps with slow progress"),
-    Field("stage_iterations", doc="iterations of this stage; of an arm the next trial"),
+    Field("stage_iterations", doc="iterations of this stage; arm placement: next trial"),
 )
 """State of damped steps, which all stages with such steps share; see `initial_lm_state`."""
 
@@ -114,7 +137,7 @@ REFINEMENT_FIELDS = (
 """State of the refinement."""
 
 BALANCE_FIELDS = (
-    Field("power", doc="number of completed powers"),
+    Field("power", doc="index of the current exponent of the p-norm"),
     Field(
         "balance_min_ratio",
         doc="smallest result of a balance: largest error relative to its tolerance",
@@ -130,7 +153,7 @@ ARM_STEP_FIELDS = (
     ),
     Field(
         "arm_start_distance",
-        doc="distance of the last entry of the start table from the palm pose",
+        doc="distance between the palm pose and that of the last start of the arm",
     ),
 )
 """State of the arm steps."""
@@ -139,11 +162,13 @@ KEPT_ACROSS_RESTARTS = (
     *("arm_start_distance", "hand_fit_minimum", "hand_fit_min_excess", "refinement_minimum"),
     *("balance_min_ratio", "repeated_minima", "best_cost", "best_q", "counts"),
 )
-"""State fields kept across restarts: the position in the start table of the numeric arm, the minima
-that were tried, and the incumbent."""
+"""State fields kept across restarts: the distance of the last start of the arm, the minima found so
+far, and the incumbent."""
 
 TRUNK_KEPT_ACROSS_RESTARTS = (
-    *("trunk_total_trials", "trunk_fitting_trials", "trunk_fitting_min_cost"),
+    "trunk_total_trials",
+    "trunk_fitting_trials",
+    "trunk_fitting_min_cost",
 )
 """State fields of multi-arm robots kept across restarts: the trunk trials."""
 
@@ -202,13 +227,13 @@ class HandFirstLayouts:
         """State of all stages: configuration, palm pose, hand posture, incumbent."""
         n = len(self.robot.actuators)
         return (
-            Field("q", (n,), doc="configuration [rad or m]; in a hand fit only of the hand"),
+            Field("q", (n,), doc="configuration [rad or m]; hand fit: the hand only"),
             Field("palm_rotation", (3, 3), doc="palm orientation of the hand, base frame"),
             Field("palm_origin", (3,), unit="m", doc="palm position of the hand, base frame"),
-            Field("phase", doc="code of the stage of the next iteration, see `Stage`"),
+            Field("phase", doc="`Stage` of the next iteration, + 32 * side"),
             Field("candidate", doc="index of the hand posture; -1: the one of q0"),
             Field("candidates_before", doc="number of hand postures of earlier restarts"),
-            Field("palm_number", doc="index of the first palm pose where contacts leave it free"),
+            Field("palm_number", doc="selects the first palm pose if contacts leave it free"),
             Field("hand_fits", doc="1 if palm and hand meet the contacts"),
             Field("is_underactuated", doc="1 if hand or arm has too few free motors"),
             Field(
@@ -248,8 +273,8 @@ class HandFirstLayouts:
         ]
         return (
             Field("side", doc="index of the side whose hand is fitted; after all: their number"),
-            Field("first_candidate", doc="index of the first hand posture of every side"),
-            Field("last_candidate", doc="largest index of a hand posture of any side"),
+            Field("first_candidate", doc="index of the hand posture at which every side starts"),
+            Field("last_candidate", doc="largest index of a hand posture that a side has reached"),
             Field("side_fits", (len(sides),), doc="1 if palm and hand meet the contacts, by side"),
             *(field for palm in palms for field in palm),
         )
@@ -265,7 +290,7 @@ class HandFirstLayouts:
             Field("trunk_trials", doc="number of trunk trials for these palm poses"),
             Field("trunk_total_trials", doc="number of trunk trials of all restarts"),
             Field("trunk_fitting_trials", doc="number of trunk trials with hands that fit"),
-            Field("trunk_fitting_min_cost", doc="smallest cost of trunk steps with such hands"),
+            Field("trunk_fitting_min_cost", doc="smallest cost of trials with hands that fit"),
             Field("is_out_of_reach", doc="1 if the target counts as out of reach"),
         )
 
@@ -311,9 +336,7 @@ class HandFirstLayouts:
         """Layout of the logged row of an iteration."""
         robot = self.robot
         return Layout.record(
-            Q.for_robot(
-                robot, "actuator positions before the step; where the arm is placed, after it"
-            ),
+            Q.for_robot(robot, "actuator positions before the step; arm placement: after it"),
             COST.for_robot(robot, "squared residual before the step"),
             POSITION_ERROR.for_robot(robot),
             ANGLE_ERROR.for_robot(robot),
@@ -373,7 +396,7 @@ class HandFirstLayouts:
         numbers = {name: ca.SX.sym(name) for name in names}
         positions, chords = self.contacts.errors(residual)
         angles = 2 * ca.asin(ca.fmin(chords / 2, 1.0))
-        # The minimum above is never NaN, but the cost is where the residual is.
+        # `fmin` hides a NaN residual; the cost is NaN then, and `cost >= 0` detects it.
         has_angle = ca.logic_and(weights[:, 1] > 0, numbers["cost"] >= 0)
         row = self.record.pack(
             {
@@ -410,7 +433,7 @@ def terms(robot: RobotDescription) -> Layout:
 
 
 def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
-    """Return the graph of the first state and the parameters of a restart.
+    """Return the graph that computes the first state and the parameters of a restart.
 
     Hand motors that only move free fingers stay at q0; every start is clipped to the bounds.
 
@@ -486,10 +509,11 @@ def _build_beginning(name: str, layouts: HandFirstLayouts) -> ca.Function:
 
 
 def _is_underactuated(layouts: HandFirstLayouts, t: dict[str, Expr]) -> Expr:
-    """Return 1 if motors of the hand are fixed, or the arm cannot move the palm to any pose.
+    """Return 1 if hand or arm have too few free motors.
 
-    An arm cannot with fewer than six free motors, whether motors are fixed, the arm is short or the
-    hand stands alone. A hand whose motors are all fixed needs no search, and counts as actuated.
+    These are hands of which some motors are fixed, and arms with fewer than six free motors, which
+    cannot reach every palm pose (also a hand without an arm). The result is 0 if all hand motors
+    are fixed, because the hand then needs no search.
     """
     hand, arm = list(layouts.robot.hand_actuators), list(layouts.arm)
     free_hand, free_arm = (
@@ -505,7 +529,14 @@ def _side_parameters(layouts: HandFirstLayouts, weights: Expr) -> dict[str, Expr
 
 
 def _palms_are_free(layouts: HandFirstLayouts, weights: Expr) -> Expr:
-    """Return 1 if contacts with `weights` (f, 2) leave a palm of a multi-arm robot a motion."""
+    """Return 1 if contacts leave palm and hand of a side a free motion.
+
+    A point has three conditions and a normal two; other kinds of contacts count as free.
+
+    Args:
+        layouts: Layouts of a multi-arm robot.
+        weights: (f, 2) 1 for a point and for a normal that is given.
+    """
     robot, finger_index = layouts.robot, layouts.robot.finger_names.index
     is_free = ca.SX(float(layouts.kinds != point_normal_kinds(len(robot.fingers))))
     for side, (_, hand) in zip(robot.sides, robot.side_actuators, strict=True):
