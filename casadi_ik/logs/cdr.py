@@ -177,8 +177,7 @@ def read_motion(path: str | os.PathLike[str]) -> RecordedMotion:
     """Read a motion from an MCAP file; `ArmHand.contacts` computes its contacts.
 
     Raises:
-        LogError: The file is missing, damaged, or not an MCAP file.
-        NoMotionError: The log holds no motion.
+        LogError: The file is missing, damaged or not an MCAP file, or it holds no motion.
 
     Example:
         >>> times, q = np.array([0.0, 0.1]), np.stack([robot.home, robot.home])
