@@ -51,7 +51,7 @@ def spoiled(field, index, value):
         (*spoiled("normals", (0, 2), 0.0), "normals: row 0, finger 2 is zero"),
         (
             *spoiled("points", (0, 1), np.nan),
-            "normals: row 0, finger 1 is given for a finger without",
+            "normals: row 0, finger 1 has a normal but no point",
         ),
         (np.full((1, 3, 3), np.nan), np.full((1, 3, 3), np.nan), "points: row 0 has no contact"),
         (*arrays(f=2), "points: found shape (2, 2, 3), expected (k, 3, 3)"),
