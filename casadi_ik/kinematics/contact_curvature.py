@@ -58,8 +58,8 @@ def residual_curvature(
         if second.nnz():
             for j, name in enumerate(joints):
                 change = second @ rates[j]
-                for i, other in enumerate(joints[: j + 1]):
-                    curvature[index[other], index[name]] += ca.dot(rates[i], change)
+                for i, proximal in enumerate(joints[: j + 1]):
+                    curvature[index[proximal], index[name]] += ca.dot(rates[i], change)
     children = {joint.name: joint.child for joint in robot.joints}
     for name, moment in moments.items():
         for joint in robot.chain(children[name]):

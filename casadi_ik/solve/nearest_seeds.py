@@ -194,8 +194,8 @@ class SeedTable:
     @cached_property
     def _arm_motors(self) -> list[int]:
         """Indices in q of the motors that move no finger relative to its palm."""
-        used = {i for group in self._finger_groups for i in group.motors}
-        return [i for i in range(len(self._robot.actuators)) if i not in used]
+        finger_motors = {i for group in self._finger_groups for i in group.motors}
+        return [i for i in range(len(self._robot.actuators)) if i not in finger_motors]
 
     @cached_property
     def _arms(self) -> tuple[Array, Array, NDArray[np.float32]]:

@@ -411,8 +411,8 @@ class TargetBuilder:
             used_motors = set[str]()
             for name, pose in grasp.palm.items():
                 if name not in self._sides:
-                    known = ", ".join(self._sides) or "none"
-                    raise InputError(f"palm.{name}: no such side; the robot's sides: {known}")
+                    sides = ", ".join(self._sides) or "none"
+                    raise InputError(f"palm.{name}: no such side; the robot's sides: {sides}")
                 side = self._sides[name]
                 positions = {
                     motor: grasp.posture[motor]
@@ -420,8 +420,10 @@ class TargetBuilder:
                     if motor in grasp.posture
                 }
                 posture = hand_posture(side, positions)
-                points, normals, more = contacts_from_palms(side, pose[None], posture[None])
-                tangents = more.get("tangents", [[None] * len(side.fingers)])[0]
+                points, normals, extra_vectors = contacts_from_palms(
+                    side, pose[None], posture[None]
+                )
+                tangents = extra_vectors.get("tangents", [[None] * len(side.fingers)])[0]
                 contacts |= {
                     finger: Contact(points[0, i], normals[0, i], tangent=tangents[i])
                     for i, finger in enumerate(side.fingers)

@@ -113,32 +113,32 @@ def place_base(args: Arguments) -> CommandResult:
             from casadi_ik.app.pictures import draw_base_placement as draw
     with located(args.palms):
         palms = _read_palms(Path(args.palms))
-        place = Solver(robot, limits=args.limits).place_base(
+        placement = Solver(robot, limits=args.limits).place_base(
             palms, np.reshape(args.region, (2, 3)), args.resolution, args.max_time
         )
-    arms = zip(place.q.tolist(), place.reached.tolist(), strict=True)
+    arms = zip(placement.q.tolist(), placement.reached.tolist(), strict=True)
     data = {
         "robot": robot.name,
-        "pose": place.pose.tolist(),
-        "base": place.base.tolist(),
-        "count": place.count,
-        "upper_bound": place.upper_bound,
-        "reached": place.reached.tolist(),
+        "pose": placement.pose.tolist(),
+        "base": placement.base.tolist(),
+        "count": placement.count,
+        "upper_bound": placement.upper_bound,
+        "reached": placement.reached.tolist(),
         "q": [q if is_reached else None for q, is_reached in arms],
     }
     write_json(args.out, data)
     if draw is not None:
-        draw(place, args.picture)
-    x, y, z, yaw = place.base.tolist()
+        draw(placement, args.picture)
+    x, y, z, yaw = placement.base.tolist()
     report = fields(
         {
-            "reached": f"{place.count} of {len(palms)} palm poses",
-            "bound": f"{place.upper_bound} (proved for all bases of the region)",
+            "reached": f"{placement.count} of {len(palms)} palm poses",
+            "bound": f"{placement.upper_bound} (proved for all bases of the region)",
             "base": f"{x:.3f} {y:.3f} {z:.3f} m, yaw {yaw:.3f} rad",
         }
     )
-    title = headline(place.count > 0, "PLACED", f"{robot.name}, {place.time:.1f} s")
-    return CommandResult.of_parts(place.count > 0, title, report, *files(outputs))
+    title = headline(placement.count > 0, "PLACED", f"{robot.name}, {placement.time:.1f} s")
+    return CommandResult.of_parts(placement.count > 0, title, report, *files(outputs))
 
 
 def _read_palms(path: Path) -> Array:

@@ -36,18 +36,18 @@ def draw_reach_map(
     figure = new_figure(12.0, 4.4, dpi)
     axes = figure.subplots(1, 3)
     image = None
-    for ax, normal, (across, up) in zip(axes, "yxz", ("xz", "yz", "xy"), strict=True):
+    for ax, normal, (horizontal, vertical) in zip(axes, "yxz", ("xz", "yz", "xy"), strict=True):
         positions, share = reach.slice(normal)
         columns, rows = (
-            positions[:, 0, "xyz".index(across)],
-            positions[0, :, "xyz".index(up)],
+            positions[:, 0, "xyz".index(horizontal)],
+            positions[0, :, "xyz".index(vertical)],
         )
         image = ax.pcolormesh(columns, rows, share.T, cmap=COLORS, vmin=0, vmax=1, rasterized=True)
         ax.plot(0, 0, marker="+", color="white", markersize=9)
         layer = positions[0, 0, "xyz".index(normal)]
         ax.set_title(f"{normal} = {layer:.2f} m", color=palette.INK, fontsize=10)
-        ax.set_xlabel(f"{across} [m]", color=palette.FAINT)
-        ax.set_ylabel(f"{up} [m]", color=palette.FAINT)
+        ax.set_xlabel(f"{horizontal} [m]", color=palette.FAINT)
+        ax.set_ylabel(f"{vertical} [m]", color=palette.FAINT)
         ax.set_aspect("equal")
         ax.set_xlim(columns[0], columns[-1])
         ax.set_ylim(rows[0], rows[-1])

@@ -53,7 +53,8 @@ class Meaning(StrEnum):
     WITHIN_TOLERANCE = "within tolerance"
     """REACHABLE and UNREACHABLE as in `Status`: the palm pose within the solver's tolerance."""
     SAMPLED = "within tolerance, sampled"
-    """As within tolerance, but nothing is refuted: the arm has no exact closed form."""
+    """Verdicts of the solver within its tolerance; nothing is UNREACHABLE, because the arm has no
+    exact closed form."""
 
 
 @dataclass(frozen=True)

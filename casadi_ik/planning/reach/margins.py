@@ -1,9 +1,9 @@
 """Margins of a palm pose: graphs that are >= 0 if and only if the arm reaches it.
 
 A branch of a closed-form arm exists if its reach margin is >= 0, and is usable if every joint is
-within its limits, which is an inequality of the direction of the joint. The margin of a palm pose
-at a value of the redundancy parameter is the largest margin of its branches, of which each is the
-smallest of these numbers.
+within its limits, which is an inequality of the direction of the joint. The margin of a branch is
+the smallest of these numbers. The margin of a palm pose at a value of the redundancy parameter is
+the largest margin of its branches.
 """
 
 from __future__ import annotations

@@ -157,12 +157,12 @@ def place_base(
     search.run(time.perf_counter() + max_time)  # compiling does not count
     search.polish()
     decision = reach.decide(_in_base(palms, search.best))
-    reached = decision.code == Reachability.REACHABLE
+    is_reached = decision.code == Reachability.REACHABLE
     return BasePlacement(
         search.best,
-        reached,
+        is_reached,
         decision.q,
-        max(search.upper_bound, int(reached.sum())),
+        max(search.upper_bound, int(is_reached.sum())),
         np.array(search.bases),
         np.array(search.counts, dtype=np.int64),
         time.perf_counter() - started,
@@ -206,9 +206,9 @@ def _base_bounds(region: Free | ArrayLike) -> tuple[Array, Array]:
 def _in_base(palms: Array, base: Array) -> Array:
     """Return palm poses (..., 4, 4) in the frames of bases (..., 4)."""
     cosine, sine = np.cos(base[..., 3]), np.sin(base[..., 3])
-    zero, one = np.zeros_like(cosine), np.ones_like(cosine)
+    zero, unit = np.zeros_like(cosine), np.ones_like(cosine)
     rotation = np.stack(
-        [cosine, sine, zero, -sine, cosine, zero, zero, zero, one], axis=-1
+        [cosine, sine, zero, -sine, cosine, zero, zero, zero, unit], axis=-1
     ).reshape(*cosine.shape, 3, 3)
     result = np.zeros(np.broadcast_shapes(palms.shape, (*cosine.shape, 4, 4)))
     result[..., :3, :3] = rotation @ palms[..., :3, :3]
@@ -282,10 +282,10 @@ class _PlacementSearch:
                     leaf_bound = max(leaf_bound, bound)
                     continue
                 for side in (lower, upper):
-                    ends = lower.copy(), upper.copy()
+                    half_box = lower.copy(), upper.copy()
                     middle = (lower[widest] + upper[widest]) / 2
-                    ends[int(side is lower)][widest] = middle
-                    queue.append((bound, *ends, palms))
+                    half_box[int(side is lower)][widest] = middle
+                    queue.append((bound, *half_box, palms))
         open_bound = max((box[0] for box in queue), default=0)
         self.upper_bound = max(self.best_count, leaf_bound, open_bound)
 
@@ -307,22 +307,22 @@ class _PlacementSearch:
         rotation, origin = palms[:, :3, :3], palms[:, :3, 3]
         is_open = np.zeros(len(rows), dtype=bool)
         for first, last in pairwise(edges.tolist()):
-            left = np.flatnonzero(~is_open)
-            if not len(left):
+            open_rows = np.flatnonzero(~is_open)
+            if not len(open_rows):
                 break
             _, bounds = self._kernels.bounds(
-                rotation[left] - width,
-                origin[left] - width,
-                np.full(len(left), first),
-                lower[left],
-                rotation[left] + width,
-                origin[left] + width,
-                np.full(len(left), last),
-                upper[left],
+                rotation[open_rows] - width,
+                origin[open_rows] - width,
+                np.full(len(open_rows), first),
+                lower[open_rows],
+                rotation[open_rows] + width,
+                origin[open_rows] + width,
+                np.full(len(open_rows), last),
+                upper[open_rows],
             )
-            is_open[left[~(bounds < 0)]] = True
-        ends = np.cumsum(counts)
-        masks = np.split(is_open, ends[:-1])
+            is_open[open_rows[~(bounds < 0)]] = True
+        stops = np.cumsum(counts)
+        masks = np.split(is_open, stops[:-1])
         return [
             (int(mask.sum()), box[1], box[2], box[3][mask])
             for mask, box in zip(masks, boxes, strict=True)
@@ -343,11 +343,11 @@ class _PlacementSearch:
         rotation, origin = palms[:, :3, :3].copy(), palms[:, :3, 3].copy()
         is_reached = np.zeros(len(palms), dtype=bool)
         for sample in self._samples:
-            left = np.flatnonzero(~is_reached)
-            if not len(left):
+            unreached = np.flatnonzero(~is_reached)
+            if not len(unreached):
                 break
-            (margin,) = self._reach.kernels.value(rotation[left], origin[left], sample)
-            is_reached[left[margin >= 0]] = True
+            (margin,) = self._reach.kernels.value(rotation[unreached], origin[unreached], sample)
+            is_reached[unreached[margin >= 0]] = True
         counts = is_reached.reshape(len(angles), len(rows)).sum(axis=1)
         index = int(np.argmax(counts))
         count = int(counts[index])
@@ -363,11 +363,11 @@ class _PlacementSearch:
         length, angle = PLACEMENT_PARAMETERS.polish_steps
         rows = np.arange(len(self._palms))
         while length >= PLACEMENT_PARAMETERS.polish_end:
-            before = self.best_count
+            previous_count = self.best_count
             for step in np.diag([length, length, length, angle]):
                 for sign in (1.0, -1.0):
                     base = np.clip(self.best + sign * step, lower, upper)
                     if not np.array_equal(base, self.best):
                         self.evaluate(base, rows, base[3:])
-            if self.best_count == before:
+            if self.best_count == previous_count:
                 length, angle = length / 2, angle / 2
