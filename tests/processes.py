@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,31 @@ NOT_ROOT = pytest.mark.skipif(
 
 ROOT = Path(__file__).parents[1]
 MODELS = ROOT / "models"
+
+
+NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}
+"""Environment of processes with a limit, which would truncate the bytecode of modules."""
+
+
+def at_most(size: int) -> Callable[[], None]:
+    """Return a function that limits the size of the files of a process [bytes]."""
+    import resource
+
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+
+
+@contextmanager
+def file_size_limit(size: int) -> Iterator[None]:
+    """Limit the size of the files of this process [bytes], like a disk that is almost full."""
+    import resource
+
+    size_before, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
+    at_most(size)()
+    try:
+        yield
+    finally:
+        at_most(size_before)()
 
 
 def python(*words: object, path: object = ROOT, **options: Any) -> subprocess.CompletedProcess[str]:

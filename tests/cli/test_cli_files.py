@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 from command_line import FAST, Command
-from processes import NOT_ROOT, POSIX
+from processes import NO_BYTECODE, NOT_ROOT, POSIX, at_most
 from torch_zip import write_torch
 
 import casadi_ik as ik
@@ -89,16 +89,6 @@ def test_outputs_do_not_overwrite_each_other_or_the_input(
     assert grasp.read_text().startswith("contacts:")
 
 
-NO_BYTECODE = {"PYTHONDONTWRITEBYTECODE": "1"}
-"""Environment of processes with a limit, which would truncate the bytecode of modules."""
-
-
-def _at_most(size: int) -> Callable[[], None]:
-    import resource
-
-    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
-
-
 @POSIX
 @pytest.mark.parametrize("size", [4_000, 16_000])
 def test_disk_full_on_the_log(
@@ -107,7 +97,7 @@ def test_disk_full_on_the_log(
     grasp = grasp_file()
     assert run("solve", grasp, *FAST).exit == 0  # kernels are compiled, nothing else is written
     words = ("solve", grasp, *FAST, "--log", "new.mcap", "--out", "new.json")
-    error = run_process(*words, preexec_fn=_at_most(size), env=NO_BYTECODE).error
+    error = run_process(*words, preexec_fn=at_most(size), env=NO_BYTECODE).error
     assert error == "new.mcap: cannot write the log: File too large"
     assert [item.name for item in tmp_path.iterdir()] == [grasp.name]
 
@@ -121,7 +111,7 @@ def test_disk_full_on_the_output(
     words = ("batch", targets, "--robot", "kuka_lwr_barrett", *FAST, "--out", out)
     assert run(*words).exit == 0
     data_before = out.read_bytes()
-    error = run_process(*words, preexec_fn=_at_most(2_000), env=NO_BYTECODE).error
+    error = run_process(*words, preexec_fn=at_most(2_000), env=NO_BYTECODE).error
     assert error == f"{out}: --out: cannot be written: File too large"
     assert out.read_bytes() == data_before
     assert len(list(tmp_path.iterdir())) == 2

@@ -26,9 +26,3 @@ def write(tmp_path: Path) -> Callable[..., Path]:
         return path
 
     return run
-
-
-@pytest.fixture
-def set_chunk_size(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
-    """Set the size of messages after which a chunk ends [bytes], so that small logs have many."""
-    return lambda size: monkeypatch.setattr("casadi_ik.logs.chunk_writer.CHUNK_SIZE", size)

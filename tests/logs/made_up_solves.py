@@ -38,7 +38,7 @@ __all__ = [
 ]
 __all__ += ["SolveBlock", "TargetBatch", "TraceFormat", "changed", "chunks_of", "event_format"]
 __all__ += ["main", "make_block", "make_rows", "parse_layout", "rewritten", "schema_name"]
-__all__ += ["schema_text"]
+__all__ += ["schema_text", "write_bag"]
 
 FINGERS = ("thumb", "finger_2", "finger_3")
 PHASES = ("thumb reaching", "hand alignment", "refinement")
@@ -172,6 +172,14 @@ def rewritten(
             pairs = sorted(pair for pair in entries.items() if pair[0] != "crc32")
             entries["crc32"] = f"{zlib.crc32(json.dumps(pairs).encode()):08x}"
             writer.add_metadata(record.name, entries)
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(
+                attachment.create_time,
+                attachment.log_time,
+                attachment.name,
+                attachment.media_type,
+                attachment.data,
+            )
         channels: dict[int, int] = {}
         for form, channel_schema, message in reader.iter_messages():
             assert form is not None
@@ -188,3 +196,17 @@ def rewritten(
             writer.add_message(channels[channel_schema.id], *times, message.sequence)
         writer.finish()
     return copy
+
+
+def write_bag(path: Path, metadata: str = "", **options: object) -> None:
+    """Write an MCAP file of another program, perhaps with metadata of that name."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)  # type: ignore[arg-type]
+        writer.start("ros2", "a recorder")
+        if metadata:
+            writer.add_metadata(metadata, {"robot": "made_up"})
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        channel = writer.register_channel("/x", "cdr", schema)
+        for i in range(20):
+            writer.add_message(channel, i, bytes(12), i)
+        writer.finish()

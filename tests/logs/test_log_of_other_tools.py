@@ -8,12 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_up_solves import LABELS, LAYOUT, Field, Layout, TraceFormat, main, make_block, rewritten
+from made_up_solves import (
+    LABELS,
+    LAYOUT,
+    Field,
+    Layout,
+    TraceFormat,
+    main,
+    make_block,
+    rewritten,
+    write_bag,
+)
 from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk, MessageIndex, Metadata
 from mcap.stream_reader import StreamReader
-from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType, Writer
+from mcap.writer import MCAP0_MAGIC, CompressionType, IndexType
 
 from casadi_ik import errors, logs
 
@@ -140,33 +150,12 @@ def test_messages_without_chunks_are_read(log: Path, closed: bool, tmp_path: Pat
     assert rows_of(tmp_path / "merged.mcap") == expected
 
 
-@pytest.mark.usefixtures("small_sections")
-def test_messages_without_chunks_are_read_up_to_a_cut(log: Path) -> None:
-    copy = rewritten(log, use_chunking=False)
-    data, truth = copy.read_bytes(), logs.open(log).iterations(method="enhanced-dls")
-    lengths, counts = range(len(data), len(data) * 2 // 3, -499), []
-    for length in lengths:
-        copy.write_bytes(data[:length])
-        rows = logs.open(copy).iterations(method="enhanced-dls").rows
-        assert rows.tobytes() == truth.rows[: len(rows)].tobytes()
-        counts.append(len(rows))
-    assert counts == sorted(counts, reverse=True)
-    assert counts[0] == len(truth) > counts[-1] > 0
-
-
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_bag_without_chunks_is_not_a_log(
     log: Path, closed: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = log.with_name("bag.mcap")
-    with path.open("wb") as stream:
-        writer = Writer(stream, use_chunking=False)
-        writer.start("ros2", "a recorder")
-        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
-        channel = writer.register_channel("/x", "cdr", schema)
-        for i in range(20):
-            writer.add_message(channel, i, bytes(12), i)
-        writer.finish()
+    write_bag(path, use_chunking=False)
     if not closed:
         path.write_bytes(path.read_bytes()[:-30])
     data_before = path.read_bytes()
@@ -177,17 +166,6 @@ def test_a_bag_without_chunks_is_not_a_log(
         assert main(["log", *words, str(path)]) == 2
         assert capsys.readouterr().err.count("\n") == 1
     assert path.read_bytes() == data_before
-
-
-def write_bag(path: Path) -> None:
-    """Write an MCAP file of another program."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2", "a recorder")
-        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
-        channel = writer.register_channel("/x", "cdr", schema)
-        writer.add_message(channel, 1, bytes(12), 1)
-        writer.finish()
 
 
 def test_a_folder_with_logs_of_other_objects_and_a_bag(
