@@ -19,7 +19,7 @@ from casadi_ik.files.shipped import resolve_description
 from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links, largest_excess
 from casadi_ik.integrations.importing.meshes import IndexedMesh, merge_meshes
 from casadi_ik.integrations.importing.robot_shapes import allowed_overlaps
-from casadi_ik.model.linkage import link_poses
+from casadi_ik.model.joints import link_poses
 from casadi_ik.model.parts import part_from_file
 from casadi_ik.model.schema import ArmFile, HandFile
 

@@ -18,8 +18,7 @@ from casadi_ik.collision.scene import Obstacle
 from casadi_ik.collision.solids import Kind, Solid, ray_points, sphere_directions
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.joints import Joint
-from casadi_ik.model.linkage import joint_positions
+from casadi_ik.model.joints import Joint, joint_positions
 
 
 @dataclass(frozen=True, eq=False)

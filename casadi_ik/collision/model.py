@@ -18,8 +18,8 @@ from casadi_ik.errors import DescriptionError, UnsupportedError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.forward import Pose, actuated
 from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.joints import rigid_bodies
 from casadi_ik.model.link_shapes import LinkCapsule, Shapes, Touching
-from casadi_ik.model.linkage import rigid_bodies
 
 
 @dataclass(frozen=True, eq=False)

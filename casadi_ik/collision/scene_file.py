@@ -31,9 +31,8 @@ from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import finite_points, read_points
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix
 from casadi_ik.files.units import Distance, Factor, Length, PureNumber, Size
-from casadi_ik.model.mesh_shape import load_mesh_shape
+from casadi_ik.model.mesh_shape import load_mesh_shape, read_body
 from casadi_ik.model.schema import TouchingEntry
-from casadi_ik.model.urdf_body import read_body
 
 Quaternion = tuple[PureNumber, PureNumber, PureNumber, PureNumber]
 PoseRow = tuple[PureNumber, PureNumber, PureNumber, Length]

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import UnknownNameError, UnsupportedError
 from casadi_ik.files.arrays import Array, read_only
-from casadi_ik.model.joints import Actuator, Joint
+from casadi_ik.model.joints import Actuator, Joint, chain_to, links_of
 from casadi_ik.model.link_shapes import NO_SHAPES, Shapes
-from casadi_ik.model.linkage import chain_to, links_of
 from casadi_ik.model.motor_ranges import motor_ranges
 
 CONTINUOUS_LIMIT = 1e6

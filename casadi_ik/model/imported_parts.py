@@ -13,9 +13,8 @@ from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import read_only
 from casadi_ik.files.reading import frame_matrix
 from casadi_ik.model.couplings import Coupling, Linear
-from casadi_ik.model.joints import Actuator, Joint
+from casadi_ik.model.joints import Actuator, Joint, joint_motion, joints_below, leaf_links
 from casadi_ik.model.link_shapes import NO_SHAPES, link_shapes
-from casadi_ik.model.linkage import joint_motion, joints_below, leaf_links
 from casadi_ik.model.parts import RobotPart, check_couplings
 from casadi_ik.model.schema import ArmFromFile, CollisionEntry, HandFromFile, LinkFrame, PadEntry
 from casadi_ik.model.urdf_mjcf import read_tree

@@ -1,11 +1,18 @@
-"""Joints and motors of a robot as frozen data."""
+"""Joints and motors as frozen data, and trees of joints: order, chains, forward kinematics.
+
+Forward kinematics are in NumPy, for one or many configurations: no graph is built or compiled.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.couplings import Coupling
 
@@ -67,3 +74,191 @@ class Actuator:
     part: str
     effort: float = np.inf
     continuous: bool = False
+
+
+class TreeEdge(Protocol):
+    """A connection of a parent and a child link."""
+
+    @property
+    def parent(self) -> str:
+        """Parent link."""
+        ...
+
+    @property
+    def child(self) -> str:
+        """Child link."""
+        ...
+
+
+class TypedEdge(TreeEdge, Protocol):
+    """A connection with a type: "fixed", or a type of joint that moves."""
+
+    @property
+    def type(self) -> str:
+        """Type of the connection."""
+        ...
+
+
+L = TypeVar("L", bound=TreeEdge)
+J = TypeVar("J", bound=TypedEdge)
+J_co = TypeVar("J_co", bound=TypedEdge, covariant=True)
+
+
+class JointTree(Protocol[J_co]):
+    """A tree of links and joints: of a file, a part or a robot."""
+
+    @property
+    def root(self) -> str:
+        """Root link."""
+        ...
+
+    @property
+    def joints(self) -> Sequence[J_co]:
+        """Joints, parents before children."""
+        ...
+
+
+def parents_first(joints: Iterable[L], root: str) -> tuple[L, ...]:
+    """Return joints with parents before children, otherwise in their order.
+
+    Joints that are not connected to the root are omitted.
+    """
+    connected, remaining = {root}, list(joints)
+    ordered: list[L] = []
+    while remaining:
+        joint = next((joint for joint in remaining if joint.parent in connected), None)
+        if joint is None:
+            break
+        remaining.remove(joint)
+        ordered.append(joint)
+        connected.add(joint.child)
+    return tuple(ordered)
+
+
+def require_name(name: str, names: Collection[str], noun: str, location: str) -> str:
+    """Return the name of a link or joint if it exists.
+
+    Raises:
+        DescriptionError: The name does not exist; the message lists those that do.
+    """
+    if name not in names:
+        raise DescriptionError(f"{location}: unknown {noun} {name!r}; known: {', '.join(names)}")
+    return name
+
+
+def links_of(tree: JointTree[TypedEdge]) -> tuple[str, ...]:
+    """Return all links, the root first."""
+    return (tree.root, *(joint.child for joint in tree.joints))
+
+
+def chain_to(tree: JointTree[J], link: str, start: str | None = None) -> list[J]:
+    """Return the joints from the root, or from the link `start`, to a link, in order."""
+    by_child = {joint.child: joint for joint in tree.joints}
+    chain: list[J] = []
+    while link != start and link in by_child:
+        chain.append(by_child[link])
+        link = by_child[link].parent
+    return chain[::-1]
+
+
+def joints_below(tree: JointTree[J], link: str) -> list[J]:
+    """Return all joints that a link carries, directly or indirectly."""
+    links, joints = {link}, []
+    for joint in tree.joints:
+        if joint.parent in links:
+            links.add(joint.child)
+            joints.append(joint)
+    return joints
+
+
+def rigid_links(tree: JointTree[TypedEdge], link: str) -> list[str]:
+    """Return a link and all links below that are fixed to it."""
+    links = [link]
+    for joint in tree.joints:
+        if joint.type == "fixed" and joint.parent in links:
+            links.append(joint.child)
+    return links
+
+
+def moving_below(tree: JointTree[J], link: str) -> list[J]:
+    """Return the first moving joints below a link, including those behind fixed joints."""
+    links = rigid_links(tree, link)
+    return [joint for joint in tree.joints if joint.type != "fixed" and joint.parent in links]
+
+
+def joint_depth(tree: JointTree[TypedEdge], link: str) -> int:
+    """Return the largest number of moving joints in series below a link."""
+    depths = (1 + joint_depth(tree, joint.child) for joint in moving_below(tree, link))
+    return max(depths, default=0)
+
+
+def leaf_links(tree: JointTree[TypedEdge], link: str) -> list[str]:
+    """Return the links below a link that have no children."""
+    parents = {joint.parent for joint in tree.joints}
+    return [joint.child for joint in joints_below(tree, link) if joint.child not in parents]
+
+
+def rigid_bodies(tree: JointTree[TypedEdge]) -> tuple[dict[str, str], set[frozenset[str]]]:
+    """Return the moving link that each link is fixed to, and the pairs that share a joint."""
+    bodies, neighbours = {tree.root: tree.root}, set()
+    for joint in tree.joints:
+        parent = bodies[joint.parent]
+        bodies[joint.child] = parent if joint.type == "fixed" else joint.child
+        neighbours.add(frozenset((parent, bodies[joint.child])))
+    return bodies, neighbours
+
+
+def joint_positions(joints: Iterable[Joint], motors: Mapping[str, ArrayLike]) -> dict[str, Array]:
+    """Return the positions (k,) of all movable joints, after couplings, by name.
+
+    Args:
+        joints: All joints that couplings refer to, in any order.
+        motors: Positions by motor [rad or m], numbers or (k,).
+    """
+    by_name = {joint.name: joint for joint in joints if joint.type != "fixed"}
+    positions = {name: np.atleast_1d(np.asarray(value, float)) for name, value in motors.items()}
+
+    def position(name: str) -> Array:
+        if name not in positions:
+            coupling = by_name[name].coupling
+            assert coupling is not None, f"joint {name!r} has no motor"
+            positions[name] = coupling.followed(position(coupling.of))
+        return positions[name]
+
+    return {name: position(name) for name in by_name}
+
+
+def link_poses(
+    root: str, joints: Iterable[Joint], values: Mapping[str, ArrayLike]
+) -> dict[str, Array]:
+    """Return the poses of links in the root's frame by name.
+
+    Args:
+        root: Root link.
+        joints: Joints from the root outwards: all, or those of some chains.
+        values: Positions by joint name [rad or m], numbers or (k,); other joints are at zero.
+
+    Returns:
+        (4, 4) each, or (k, 4, 4) for links that a joint with k positions moves.
+    """
+    poses = {root: np.eye(4)}
+    for joint in joints:
+        pose = poses[joint.parent] @ joint.placement
+        if joint.name in values:
+            pose = pose @ joint_motion(joint.type, joint.axis, values[joint.name])
+        poses[joint.child] = pose
+    return poses
+
+
+def joint_motion(kind: str, axis: Array, positions: ArrayLike) -> Array:
+    """Return the displacement (..., 4, 4) of a joint at positions (...) [rad or m]."""
+    value = np.asarray(positions, dtype=float)[..., None, None]
+    pose = np.zeros((*value.shape[:-2], 4, 4)) + np.eye(4)
+    if kind == "prismatic":
+        pose[..., :3, 3] = value[..., 0] * axis
+    elif kind == "revolute":
+        # Rodrigues' formula.
+        x, y, z = axis
+        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        pose[..., :3, :3] += np.sin(value) * cross + (1 - np.cos(value)) * (cross @ cross)
+    return pose

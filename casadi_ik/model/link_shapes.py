@@ -12,7 +12,7 @@ import numpy as np
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array, read_only
 from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.model.linkage import require_name
+from casadi_ik.model.joints import require_name
 from casadi_ik.model.schema import (
     CollisionEntry,
     LinkBoxEntry,

@@ -21,7 +21,7 @@ from casadi_ik.model.joining import (
     join_parts,
     load_part,
 )
-from casadi_ik.model.linkage import chain_to, joints_below, require_name
+from casadi_ik.model.joints import chain_to, joints_below, require_name
 from casadi_ik.model.parts import (
     RobotPart,
     mirrored,

@@ -14,10 +14,9 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import Struct, read
 from casadi_ik.files.shipped import resolve_description
 from casadi_ik.files.units import Factor, Mass
-from casadi_ik.model.mesh_shape import MeshShape, load_mesh_shape
+from casadi_ik.model.mesh_shape import BODY_FORMATS, MeshShape, load_mesh_shape
 from casadi_ik.model.parts import require_source
 from casadi_ik.model.shapes import Mesh, Shape
-from casadi_ik.model.urdf_body import BODY_FORMATS
 
 
 class MassEntry(Struct, frozen=True):

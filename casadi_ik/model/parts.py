@@ -15,9 +15,8 @@ from casadi_ik.files.arrays import Array, read_only
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.reading import frame_matrix
 from casadi_ik.model.couplings import Linear
-from casadi_ik.model.joints import Actuator, Joint
+from casadi_ik.model.joints import Actuator, Joint, links_of, parents_first, require_name
 from casadi_ik.model.link_shapes import NO_SHAPES, Shapes, link_shapes
-from casadi_ik.model.linkage import links_of, parents_first, require_name
 from casadi_ik.model.schema import ActuatorEntry, ArmFile, HandFile, JointEntry, PadEntry
 
 

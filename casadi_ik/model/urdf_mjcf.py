@@ -27,7 +27,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.model import sandbox
 from casadi_ik.model.couplings import Coupling, Linear, Polynomial
-from casadi_ik.model.linkage import joint_motion, parents_first
+from casadi_ik.model.joints import joint_motion, parents_first
 from casadi_ik.model.xml_tree import (
     Element,
     RobotTree,

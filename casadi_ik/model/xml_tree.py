@@ -18,7 +18,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.files.reading import Frame, frame_matrix, read_text, roll_pitch_yaw
 from casadi_ik.model.couplings import Coupling
-from casadi_ik.model.linkage import chain_to, links_of, require_name
+from casadi_ik.model.joints import chain_to, links_of, require_name
 from casadi_ik.model.schema import (
     LinkBoxEntry,
     LinkCapsuleEntry,

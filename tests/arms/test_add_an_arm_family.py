@@ -12,7 +12,7 @@ SCRIPT = """
 import sys
 import numpy as np
 import casadi_ik as ik
-from casadi_ik.kinematics.arms.recognise import (describe_arm)
+from casadi_ik.kinematics.arms.recognise import describe_arm
 
 robot = ik.load_robot(sys.argv[1])
 assert describe_arm(robot.description) == "nearly gimbal", describe_arm(robot.description)
@@ -38,6 +38,6 @@ def test_a_family_is_added_in_two_files(tmp_path):
     registry = package / "kinematics" / "arms" / "recognise.py"
     (old,) = re.findall(r"^FAMILIES: .*$", registry.read_text(), re.MULTILINE)
     replace(registry, old, row.rstrip())
-    imported = "from casadi_ik.kinematics.arms.locked_joints"
+    imported = "from casadi_ik.kinematics.arms.offset_wrist"
     replace(registry, imported, f"from casadi_ik.kinematics.arms.gimbal import Gimbal\n{imported}")
     run_with(package, SCRIPT, part_of_the_arm(tmp_path / "robot", slice(4, None)))

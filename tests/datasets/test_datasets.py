@@ -18,7 +18,7 @@ import casadi_ik as ik
 from casadi_ik.app.report import reasons
 from casadi_ik.integrations.datasets.layouts import load_convention
 from casadi_ik.integrations.datasets.postures import HandPoses
-from casadi_ik.model.linkage import link_poses
+from casadi_ik.model.joints import link_poses
 from casadi_ik.model.objects import load_object
 
 PUBLISHED = json.loads((Path(__file__).parent / "published_hands.json").read_text())

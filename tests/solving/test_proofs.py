@@ -20,9 +20,8 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.couplings import COUPLING_ROWS, Interval
 from casadi_ik.model.couplings import Polynomial
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.proofs.arm_tests import PointInPalm
 from casadi_ik.solve.proofs.boxes import box_contacts
-from casadi_ik.solve.proofs.contact_tests import pair_rows
+from casadi_ik.solve.proofs.contact_tests import PointInPalm, pair_rows
 from casadi_ik.solve.proofs.premises import arm_cones
 from casadi_ik.solve.proofs.proof import Proof, ProofKind
 from casadi_ik.solve.proofs.prove import PROVER_EFFORT, Prover

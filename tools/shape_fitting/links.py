@@ -9,7 +9,7 @@ import numpy as np
 
 from casadi_ik.files.arrays import Array
 from casadi_ik.integrations.importing.meshes import IndexedMesh, link_meshes
-from casadi_ik.model.linkage import joints_below, link_poses
+from casadi_ik.model.joints import joints_below, link_poses
 from casadi_ik.model.parts import RobotPart
 from casadi_ik.model.urdf_mjcf import read_tree
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint

@@ -26,7 +26,7 @@ from casadi_ik.integrations.datasets.postures import (
 )
 from casadi_ik.integrations.datasets.unpickling import PickledArray, read_npy, read_torch
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.model.linkage import joint_motion
+from casadi_ik.model.joints import joint_motion
 from casadi_ik.model.pose import inverse
 
 

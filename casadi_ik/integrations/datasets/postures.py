@@ -14,7 +14,7 @@ from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.poses import nearest_rotations, rotation_problem
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.linkage import joint_motion, link_poses
+from casadi_ik.model.joints import joint_motion, link_poses
 from casadi_ik.model.pose import inverse
 
 

@@ -13,7 +13,7 @@ from casadi_ik.integrations.importing.limbs import (
     limb_ends,
     palms,
 )
-from casadi_ik.model.linkage import joints_below, leaf_links, moving_below, rigid_links
+from casadi_ik.model.joints import joints_below, leaf_links, moving_below, rigid_links
 from casadi_ik.model.multi_arm import MAX_SIDES
 from casadi_ik.model.xml_tree import RobotTree
 

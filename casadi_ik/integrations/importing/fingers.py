@@ -5,8 +5,14 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 
-from casadi_ik.model.joints import Joint
-from casadi_ik.model.linkage import chain_to, joint_depth, joints_below, moving_below, rigid_links
+from casadi_ik.model.joints import (
+    Joint,
+    chain_to,
+    joint_depth,
+    joints_below,
+    moving_below,
+    rigid_links,
+)
 from casadi_ik.model.parts import RobotPart
 
 FINGER_PATTERNS = {

@@ -6,8 +6,7 @@ import numpy as np
 
 from casadi_ik.files.arrays import Array
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.joints import Joint
-from casadi_ik.model.linkage import joint_positions, link_poses
+from casadi_ik.model.joints import Joint, joint_positions, link_poses
 
 HOME_SAMPLES = 300
 """Number of arm postures that are compared for an arm of `FULLY_SAMPLED_JOINTS` or fewer."""

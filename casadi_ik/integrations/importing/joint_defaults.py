@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from casadi_ik.model.linkage import joints_below, moving_below
+from casadi_ik.model.joints import joints_below, moving_below
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
 ASSUMED_LIMITS = {"revolute": (-math.pi, math.pi), "prismatic": (-0.5, 0.5)}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casadi_ik.model.linkage import chain_to, joints_below, moving_below
+from casadi_ik.model.joints import chain_to, joints_below, moving_below
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
 
 MIN_ARM_JOINTS = 6

@@ -17,8 +17,7 @@ from casadi_ik.integrations.importing.part_geometry import (
     transform_point,
     unit_vector,
 )
-from casadi_ik.model.joints import Joint
-from casadi_ik.model.linkage import chain_to, rigid_links
+from casadi_ik.model.joints import Joint, chain_to, rigid_links
 from casadi_ik.model.parts import RobotPart
 
 MIN_COS_TILT = np.cos(np.deg2rad(45.0))

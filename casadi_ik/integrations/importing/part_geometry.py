@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.model.linkage import link_poses
+from casadi_ik.model.joints import link_poses
 from casadi_ik.model.parts import RobotPart
 
 

@@ -32,7 +32,7 @@ from casadi_ik.integrations.importing.palm_frame import guess_palm_frame, guess_
 from casadi_ik.integrations.importing.robot_shapes import robot_shapes
 from casadi_ik.integrations.importing.write import FileEntry, HandEntry, ImportedDescription
 from casadi_ik.model.imported_parts import hand_from_file
-from casadi_ik.model.linkage import chain_to, rigid_links
+from casadi_ik.model.joints import chain_to, rigid_links
 from casadi_ik.model.load_robot import load_description
 from casadi_ik.model.parts import RobotPart
 from casadi_ik.model.schema import HandFromFile

@@ -21,8 +21,8 @@ from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links
 from casadi_ik.integrations.importing.meshes import IndexedMesh, link_meshes
 from casadi_ik.integrations.importing.triangle_tree import CollisionTree
 from casadi_ik.model.description import RobotDescription
+from casadi_ik.model.joints import joint_positions, joints_below, link_poses, rigid_bodies
 from casadi_ik.model.link_shapes import Touching, capsules_of
-from casadi_ik.model.linkage import joint_positions, joints_below, link_poses, rigid_bodies
 from casadi_ik.model.parts import HAND_PREFIX, RobotPart
 from casadi_ik.model.schema import ShapeEntry
 from casadi_ik.model.xml_tree import RobotTree

@@ -15,8 +15,7 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.family import SphericalJoints
 from casadi_ik.kinematics.arms.recognise import srs_arm
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.joints import Joint
-from casadi_ik.model.linkage import link_poses
+from casadi_ik.model.joints import Joint, link_poses
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
