@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -22,8 +22,6 @@ import casadi_ik as ik
 
 if TYPE_CHECKING:
     from pinocchio_oracle import PinocchioRobot
-
-    from casadi_ik.app.viewer import Viewer
 
 REFERENCE = re.compile(r"^ *(?:import|from) (?:pinocchio|coal)(?:_oracle)?\b", re.MULTILINE)
 """A test module that asks other libraries for a second opinion: the extra `reference`."""
@@ -104,13 +102,13 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def view() -> Iterator[Callable[..., Viewer]]:
+def view() -> Iterator[Callable[..., Any]]:
     """Function that opens the viewer of `casadi-ik view` without waiting for its end."""
     from commands import view_of
 
     with ExitStack() as stack:
 
-        def open_page(*words: str) -> Viewer:
+        def open_page(*words: str) -> Any:
             viewer = view_of(*words)
             stack.callback(viewer.stop)
             return viewer

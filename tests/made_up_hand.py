@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 import casadi_ik as ik
-from casadi_ik.files.arrays import Array
 
 BONES = (0.045, 0.027, 0.022)
 """Of a finger behind its knuckle [m]."""
 
 
-def hand(bend: float, wrist: Array, turn: float = 0.0) -> Array:
+def hand(bend: float, wrist: np.ndarray, turn: float = 0.0) -> np.ndarray:
     """(21, 3) keypoints [m].
 
     Args:
@@ -34,7 +33,7 @@ def hand(bend: float, wrist: Array, turn: float = 0.0) -> Array:
     return np.array(points) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + wrist
 
 
-def like_robot(robot: ik.ArmHand, path: Array, size: float) -> Array:
+def like_robot(robot: ik.ArmHand, path: np.ndarray, size: float) -> np.ndarray:
     """(k, 21, 3) keypoints of a person who moves as a robot does along a path (k, n).
 
     The person is smaller by `size` and sits elsewhere; thumb, index and middle finger go with the

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import yaml
+from processes import MODELS
 
 import casadi_ik as ik
-from casadi_ik.files.shipped import models_folder
 
 COUPLED_HAND = """\
 name: coupled_hand
@@ -92,10 +92,9 @@ def write_coupled_robot(folder: Path) -> Path:
 
 def copy_shipped_robot(folder: Path) -> Path:
     """Copies of the shipped robot, arm and hand as robot.yaml, arm.yaml, hand.yaml."""
-    models = models_folder()
-    shutil.copy(models / "arms" / "kuka_lwr4.yaml", folder / "arm.yaml")
-    shutil.copy(models / "hands" / "barrett_bh8_280.yaml", folder / "hand.yaml")
-    text = (models / "arm_hands" / "kuka_lwr_barrett.yaml").read_text()
+    shutil.copy(MODELS / "arms" / "kuka_lwr4.yaml", folder / "arm.yaml")
+    shutil.copy(MODELS / "hands" / "barrett_bh8_280.yaml", folder / "hand.yaml")
+    text = (MODELS / "arm_hands" / "kuka_lwr_barrett.yaml").read_text()
     path = folder / "robot.yaml"
     path.write_text(
         text.replace("arm: kuka_lwr4", "arm: arm.yaml").replace(

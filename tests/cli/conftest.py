@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import yaml
 from command_line import POSTURE, Command, Run, solvable
+from commands import main
 from processes import python
 
 import casadi_ik as ik
-from casadi_ik.app.cli.main import main
 
 
 @pytest.fixture

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import FAST, Command, Run
+from commands import COMMANDS, GROUPS, load
 from processes import POSIX
 
 import casadi_ik as ik
-from casadi_ik.app.cli.table import COMMANDS, GROUPS, load
 from casadi_ik.integrations.datasets import LAYOUT_NAMES
 
 PROGRAM = [sys.executable, "-m", "casadi_ik"]

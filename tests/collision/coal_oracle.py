@@ -7,16 +7,15 @@ from typing import Any
 import coal
 import numpy as np
 from capsule_arm import SCENE
+from scipy.spatial.transform import Rotation
 
-from casadi_ik.files.arrays import Array
-from casadi_ik.files.reading import Frame, frame_matrix
-from casadi_ik.kinematics.arm_hand import ArmHand
+import casadi_ik as ik
 
 
-def described(robot: ArmHand) -> list[tuple[str, Any, Array]]:
+def described(robot: ik.ArmHand) -> list[tuple[str, Any, np.ndarray]]:
     """Link, shape and (4, 4) pose in the link of every shape as it is described."""
     shapes = robot.description.shapes
-    solids: list[tuple[str, Any, Array]] = []
+    solids: list[tuple[str, Any, np.ndarray]] = []
     for capsule in shapes.capsules:
         if capsule.covers < 0:
             length = float(np.linalg.norm(capsule.half_axis))
@@ -32,18 +31,20 @@ def described(robot: ArmHand) -> list[tuple[str, Any, Array]]:
     return solids
 
 
-def frame_along(axis: Array) -> Array:
+def frame_along(axis: np.ndarray) -> np.ndarray:
     """(3, 3) rotation whose z is an axis."""
     side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
     side /= np.linalg.norm(side)
     return np.column_stack([side, np.cross(axis, side), axis])
 
 
-def in_scene() -> dict[str, tuple[Any, Array]]:
+def in_scene() -> dict[str, tuple[Any, np.ndarray]]:
     """The scene's shapes with their poses."""
-    solids: dict[str, tuple[Any, Array]] = {}
+    solids: dict[str, tuple[Any, np.ndarray]] = {}
     for name, entry in SCENE.items():
-        pose = frame_matrix(Frame(tuple(entry["xyz"]), tuple(entry.get("rpy", (0, 0, 0)))))
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("xyz", entry.get("rpy", (0, 0, 0))).as_matrix()
+        pose[:3, 3] = entry["xyz"]
         match entry["kind"]:
             case "box":
                 shape = coal.Box(*entry["size"])
@@ -67,7 +68,7 @@ def in_scene() -> dict[str, tuple[Any, Array]]:
     return solids
 
 
-def distance(solid: Any, at_one: Array, other_solid: Any, at_other: Array) -> float:
+def distance(solid: Any, at_one: np.ndarray, other_solid: Any, at_other: np.ndarray) -> float:
     """Signed distance [m]."""
     request, result = coal.DistanceRequest(True), coal.DistanceResult()
     places = (coal.Transform3s(pose[:3, :3], pose[:3, 3]) for pose in (at_one, at_other))

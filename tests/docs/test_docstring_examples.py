@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.solve import registry
 
 SUBMODULES = tuple(name for name in ik.__all__ if inspect.ismodule(getattr(ik, name)))
 WITHOUT_EXAMPLE = {
@@ -115,7 +114,7 @@ def names(folder: Path) -> dict[str, Any]:
 @pytest.mark.slow
 def test_examples(names: dict[str, Any], folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+    monkeypatch.setattr(ik.solve.registry, "_ENTRIES", dict(ik.solve.registry._ENTRIES))
     parser = doctest.DocTestParser()
     report: list[str] = []
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)

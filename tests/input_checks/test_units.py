@@ -10,7 +10,6 @@ import yaml
 from commands import main
 
 import casadi_ik as ik
-from casadi_ik.errors import InputWarning
 
 WALL = {"kind": "box", "size": [2.0, 0.02, 2.0], "xyz": [0.6, 0.5, 0.5]}
 
@@ -38,18 +37,18 @@ def test_scenes_in_millimetres(name, tmp_path):
         warnings.simplefilter("error")
         ik.Scene({name: SOLIDS[name]})
     wrong = scaled(SOLIDS[name], 1e3)
-    with pytest.warns(InputWarning, match=rf"solids\.{name}.*mm"):
+    with pytest.warns(ik.errors.InputWarning, match=rf"solids\.{name}.*mm"):
         ik.Scene({name: wrong})
     path = tmp_path / "scene.yaml"
     path.write_text(yaml.safe_dump({"solids": {name: wrong}}))
-    with pytest.warns(InputWarning, match=rf"scene\.yaml: solids\.{name}.*mm"):
+    with pytest.warns(ik.errors.InputWarning, match=rf"scene\.yaml: solids\.{name}.*mm"):
         ik.load_scene(path)
 
 
 def test_a_pose_in_millimetres():
     pose = np.eye(4)
     pose[:3, 3] = [600.0, 500.0, 500.0]
-    with pytest.warns(InputWarning, match="wall"):
+    with pytest.warns(ik.errors.InputWarning, match="wall"):
         ik.Scene({"wall": WALL}).moved("wall", pose)
 
 
@@ -66,9 +65,9 @@ def test_a_mesh_in_millimetres(tmp_path):
     lines = [f"v {x} {y} {z}" for x, y, z in box] + [f"f {face}" for face in faces.split(",")]
     path = tmp_path / "box.obj"
     path.write_text("\n".join(lines) + "\n")
-    with pytest.warns(InputWarning, match=r"box\.obj.*mm"):
+    with pytest.warns(ik.errors.InputWarning, match=r"box\.obj.*mm"):
         ik.Scene({"a": {"kind": "mesh", "file": str(path), "parts": True}})
-    with pytest.warns(InputWarning, match="mm"), pytest.raises(ik.errors.InputError):
+    with pytest.warns(ik.errors.InputWarning, match="mm"), pytest.raises(ik.errors.InputError):
         ik.load_surface(path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -88,7 +87,7 @@ def test_contacts_in_millimetres(robot):
         lambda: solver.solve(grasp, diagnose=False),
         lambda: solver.solve_batch(1e3 * points[None], normals[None]),
     ):
-        with pytest.warns(InputWarning, match=r"m from the robot's base.*mm"):
+        with pytest.warns(ik.errors.InputWarning, match=r"m from the robot's base.*mm"):
             ask()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -101,11 +100,11 @@ def test_contacts_in_millimetres(robot):
 )
 def test_tolerances_in_other_units(robot, tmp_path, capsys, position, angle, match):
     tolerance = ik.Tolerance(position, angle)
-    with pytest.warns(InputWarning, match=match):
+    with pytest.warns(ik.errors.InputWarning, match=match):
         ik.Solver(robot, tolerance=tolerance)
-    with pytest.warns(InputWarning, match="thumb"):
+    with pytest.warns(ik.errors.InputWarning, match="thumb"):
         ik.Solver(robot, tolerance={"thumb": tolerance})
-    with pytest.warns(InputWarning, match=match):
+    with pytest.warns(ik.errors.InputWarning, match=match):
         ik.Contact([0.5, 0.1, 0.4], tolerance=tolerance)
     words = ["solve", "cup", "--tolerance-position", str(position), "--tolerance-angle", str(angle)]
     assert main(words) == 0

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from made_up_solves import T0
+from made_up_solves import T0, SolveBlock
 
-from casadi_ik.logs import LogClock, McapRecorder
-from casadi_ik.solve.recorder import SolveBlock
+from casadi_ik import logs
 
 
 @pytest.fixture
@@ -19,8 +18,12 @@ def write(tmp_path: Path) -> Callable[..., Path]:
 
     def run(*blocks: SolveBlock, name: str = "cup.mcap", **options: Any) -> Path:
         path = tmp_path / name
-        settings: Mapping[str, Any] = {"robot_name": "made_up", "clock": LogClock(T0), **options}
-        with McapRecorder(path, **settings) as recorder:
+        settings: Mapping[str, Any] = {
+            "robot_name": "made_up",
+            "clock": logs.LogClock(T0),
+            **options,
+        }
+        with logs.McapRecorder(path, **settings) as recorder:
             for block in blocks:
                 recorder.record(block)
         return path

@@ -11,7 +11,6 @@ from toy_robots import grasp_of, near_home
 
 import casadi_ik as ik
 from casadi_ik import errors
-from casadi_ik.solve import registry
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +22,11 @@ def page(tmp_path_factory):
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    entries_before = dict(registry._ENTRIES)
+    entries_before = dict(ik.solve.registry._ENTRIES)
     spec.loader.exec_module(module)
     yield module
-    registry._ENTRIES.clear()
-    registry._ENTRIES.update(entries_before)
+    ik.solve.registry._ENTRIES.clear()
+    ik.solve.registry._ENTRIES.update(entries_before)
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +76,8 @@ def test_method_names_are_unique(page):
     with pytest.raises(errors.InputError, match="name: method 'damped-least-squares'"):
         ik.register_method(method.name, "again", parameter_class, method)
     ik.register_method(method.name, "again", parameter_class, method, replace=True)
-    assert registry.method_summary(method.name) == "again"
-    assert registry.method_names() == (*ik.METHODS, method.name)
+    assert ik.solve.registry.method_summary(method.name) == "again"
+    assert ik.solve.registry.method_names() == (*ik.METHODS, method.name)
     with pytest.raises(errors.InputError, match="name: method 'ipopt'"):
         ik.register_method("ipopt", "mine", parameter_class, method, replace=True)
     with pytest.raises(errors.InputError, match="expected a dataclass"):

@@ -12,7 +12,6 @@ from pinocchio_oracle import PinocchioRobot, assert_verdicts
 from toy_robots import MULTI_ARM_ROBOTS, PAPER_METHODS, grasp_of, near_home
 
 import casadi_ik as ik
-from casadi_ik.solve import registry
 
 ROBOTS = ik.shipped_names("arm_hands")
 SLOW = {("original-dls", "baxter_ar10"), ("original-sdls", "baxter_ar10")}
@@ -186,7 +185,7 @@ def test_lanes_match_single_solves(case):
     """No line of any method's code is refused by the rewriting, and on one robot it is run."""
     options = {"finger_step": "closed-form"} if case.method.startswith("enhanced") else {}
     kernel = getattr(
-        registry.build_method(case.method, case.robot.description, options), "kernel", None
+        ik.solve.registry.build_method(case.method, case.robot.description, options), "kernel", None
     )
     if kernel is None or not kernel.compiled:
         pytest.skip("no compiled loop")
@@ -418,5 +417,5 @@ def test_robot_name_is_not_a_robot():
 
 def test_every_method_has_a_summary():
     for method in ik.METHODS:
-        assert "\n" not in registry.method_summary(method)
-        assert len(registry.method_summary(method)) > 20
+        assert "\n" not in ik.solve.registry.method_summary(method)
+        assert len(ik.solve.registry.method_summary(method)) > 20

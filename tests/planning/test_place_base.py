@@ -4,9 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from commands import main
 
 import casadi_ik as ik
-from casadi_ik.app.cli.main import main
 
 BOX = ([-0.6, -0.6, 0.0], [0.6, 0.6, 0.0])
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from commands import main
 
 import casadi_ik as ik
-from casadi_ik.app.cli.main import main
 from casadi_ik.planning.reach.reach_map import ReachMap
 
 BOX = ([-0.9, -0.9, -0.2], [0.9, 0.9, 1.0])

@@ -11,7 +11,6 @@ import yaml
 from processes import ROOT, python
 
 import casadi_ik as ik
-from casadi_ik.errors import EXTRA_OF_MODULE
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ON_DEMAND = "pinocchio coal matplotlib pyvista polars mujoco scipy proxsuite trimesh collada rich"
@@ -34,7 +33,7 @@ def test_the_core_is_light():
 def test_modules_belong_to_the_extra_that_errors_name():
     extras = PROJECT["optional-dependencies"]
     packages = {"collada": "pycollada", "foxglove": "foxglove-sdk", "pinocchio": "pin"}
-    for module, extra in EXTRA_OF_MODULE.items():
+    for module, extra in ik.errors.EXTRA_OF_MODULE.items():
         package = packages.get(module, module).removesuffix("modules")
         assert any(line.startswith(f"{package}>=") for line in extras[extra]), module
 
@@ -58,7 +57,7 @@ sys.exit(code)
 def test_the_core_solves_and_logs_without_extras(tmp_path):
     mesh = tmp_path / "mesh.obj"
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
-    modules = [*EXTRA_OF_MODULE, "polars", "joblib", "dask"]
+    modules = [*ik.errors.EXTRA_OF_MODULE, "polars", "joblib", "dask"]
     modules.remove("ziglang")
     program = CORE_ONLY.format(modules=modules, log=str(tmp_path / "a.mcap"), mesh=str(mesh))
     done = python("-c", program)

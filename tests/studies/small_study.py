@@ -9,7 +9,7 @@ from runner.report import program
 from runner.study import Setting, Study, TargetSet, run
 from samplers import near_limits, random_hands
 
-from casadi_ik.logs import Keep
+import casadi_ik as ik
 
 CHANGED = Setting("loose", "hand-first", tolerance=(2e-3, 0.05))
 STUDY = Study(
@@ -25,7 +25,7 @@ STUDY = Study(
 def main() -> None:
     """Run it: FOLDER [ADDRESS of a Dask scheduler]."""
     address = sys.argv[2] if len(sys.argv) > 2 else None
-    run(STUDY, Path(sys.argv[1]), jobs=2, dask=address, log=Keep())
+    run(STUDY, Path(sys.argv[1]), jobs=2, dask=address, log=ik.logs.Keep())
 
 
 if __name__ == "__main__":
