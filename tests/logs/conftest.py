@@ -18,11 +18,7 @@ def write(tmp_path: Path) -> Callable[..., Path]:
 
     def run(*blocks: SolveBlock, name: str = "cup.mcap", **options: Any) -> Path:
         path = tmp_path / name
-        settings: Mapping[str, Any] = {
-            "robot_name": "made_up",
-            "clock": logs.LogClock(T0),
-            **options,
-        }
+        settings = {"robot_name": "made_up", "clock": logs.LogClock(T0)} | options
         with logs.McapRecorder(path, **settings) as recorder:
             for block in blocks:
                 recorder.record(block)
