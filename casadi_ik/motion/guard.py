@@ -1,11 +1,10 @@
 """Collision avoidance of a follower, cycle by cycle.
 
 Two rules keep a follower free of collisions. The goal avoids obstacles as far as the contacts
-permit: small clearances are rows of its least-squares problem. And a step is made only if the robot
-    can
-brake to rest afterwards without violating a margin in any cycle; otherwise motors brake. The step
-before was made under the same condition, so braking is safe: by induction the robot never violates
-the margin of a static obstacle.
+permit: small clearances are rows of its least-squares problem. And a step is made only if the
+robot can brake to rest afterwards without violating a margin in any cycle; otherwise motors brake.
+The step before was made under the same condition, so braking is safe: by induction the robot never
+violates the margin of a static obstacle.
 
 Cycles between which a pair cannot come near are skipped, and so are pairs that were far apart when
 all pairs were last compared. Both bounds are steps of motors times levers
@@ -124,7 +123,10 @@ class Guard:
 
     def are_free(self, q: Array) -> bool:
         """Return True if configurations (m, n) are free of collisions."""
-        return bool((self._query.check(q).surplus >= self.exact).all())
+        query, required = self._query, self._required
+        # Distances above the required one are not computed.
+        distances, _ = query.kernel.min_distances(q, query.poses, query.table, required, required)
+        return bool((distances >= required).all())
 
     def posture_with_clearance(self, q: Array, units: Array) -> Array:
         """Return the nearest configuration (n,) with the lacking clearances of one, to first order.

@@ -196,9 +196,12 @@ class FollowerInputs:
 
     def exact_error_ratio(self, q: Array) -> float:
         """Return the maximum error relative to the tolerance of the target at a posture (n,)."""
-        errors = np.stack(self.errors(q))
-        tolerances = np.stack([self.views["position_tolerance"], self.views["angle_tolerance"]])
-        return float(np.nanmax(errors / np.maximum(tolerances, 1e-12)))
+        max_step = self.views["max_step"]
+        values = max_step.copy()
+        max_step[...] = 0.0
+        ratio = self.error_ratio_at(q)
+        max_step[...] = values
+        return ratio
 
     def errors(self, q: Array) -> tuple[Array, Array]:
         """Return the errors of a posture (n,) to the target: (f,) [m], (f,) [rad], NaN if free."""

@@ -8,7 +8,8 @@ per cycle. If the minimum error is less than `GAIN` times the present one, the m
 return to that posture. They move on straight lines, each from rest to rest: to the first posture of
 the trail, counted from the destination, to which the line is free, so they take short cuts. If no
 line is free, as in contact with an obstacle, the motors first increase the clearances. The lines
-are checked at a few postures per cycle, and the guard also checks every step.
+are checked at a few postures per cycle, and the guard also checks every step. If it stops the
+motors, they increase the clearances, too, and choose a line again.
 """
 
 from __future__ import annotations
@@ -34,8 +35,11 @@ CHECK_PERIOD = 0.01
 PATIENCE = 0.2
 """Time without progress after which a follower counts as stuck [s]."""
 
-SEARCH_TIME = 0.5
-"""Time in which all postures of a full trail are compared with the target [s]."""
+SEARCH_TIME = 1.28
+"""Time in which all postures of a full trail are compared with the target [s].
+
+At periods up to 10 ms, one posture is compared per cycle.
+"""
 
 GAIN = 0.5
 """Maximum error at the destination of a return, relative to the present error."""
@@ -208,22 +212,25 @@ class Recovery:
             self._start_clock(ratio)
             self._is_returning = bool(self._least_ratio < GAIN * ratio)
             self._has_line, self._lines, self._stops = False, 0, 0
+            self._is_blocked = False
             self._target = -1
 
     def _continue_return(self, q: Array, last_step: Array, is_stopped: bool) -> None:
         """Record a step of the return, and choose the next line at the end of a line."""
         if not self._has_line:
-            if not last_step.any():
+            if last_step.any():
+                return
+            if self._is_blocked:
+                self._is_blocked = False
+                self._move_away(q)
+            else:
                 self._choose_line(q)
             return
         self._done, self._line_step = self._done + self._next_step, self._next_step
         if is_stopped:
             self._append(q)
             self._has_line = False
-            self._try_shorter_line()
-            self._stops += 1
-            if self._stops > MAX_STOPS:
-                self.follow()
+            self._is_blocked = True
         elif self._done >= 1.0 - 1e-12:
             self._has_line = False
             self._count = self._target + 1
