@@ -28,7 +28,7 @@ NO_PREFERENCE = "none"
 """Preference of methods that return the first solution they find."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(slots=True, eq=False)
 class TargetBatch:
     """A batch of k targets: everything that determines their solutions for a robot and a method.
 

@@ -35,7 +35,7 @@ from casadi_ik.solve.subproblems import (
 )
 from casadi_ik.solve.target_builder import resolve_preference
 from casadi_ik.solve.turns import nearest_turns, with_search_starts
-from casadi_ik.solve.verdict import contact_verdicts, judge
+from casadi_ik.solve.verdict import judge
 
 DEFAULT_SEPARATION = 0.25
 """Default minimum difference of alternatives, see `AlternativeFinder.find`."""
@@ -425,10 +425,9 @@ class AlternativeFinder:
     def _describe(self, targets: TargetBatch, candidate: _Candidate, q0: Array) -> Alternative:
         q = candidate.q[None]
         verdict = judge(self.robot, targets, q)
-        errors = verdict.position_error, verdict.angle_error, verdict.ok
         return Alternative(
             q=candidate.q,
-            contacts=contact_verdicts(self.robot.fingers, targets.tolerances, *errors)[0],
+            contacts=verdict.contacts(0, self.robot.fingers, targets.tolerances),
             posture=candidate.posture,
             branch=candidate.branch,
             swivel=candidate.swivel,

@@ -230,15 +230,12 @@ class FloatingPalmFit:
         nearest = smallest_per_owner(
             hand_fits.owner, np.where(hand_fits.ok, hand_fits.outside, np.inf), 1
         )
-        errors = (
-            array[best]
-            for array in (hand_fits.position_error, hand_fits.angle_error, hand_fits.met)
-        )
-        verdicts = contact_verdicts(self._subproblems.robot.fingers, targets.tolerances, *errors)
+        fingers = self._subproblems.robot.fingers
+        errors = hand_fits.position_error, hand_fits.angle_error, hand_fits.met
         evidence = []
-        for row, nearest_row, contacts in zip(
-            best.tolist(), nearest.tolist(), verdicts, strict=True
-        ):
+        for row, nearest_row in zip(best.tolist(), nearest.tolist(), strict=True):
+            row_errors = (array[row].tolist() for array in errors)
+            contacts = contact_verdicts(fingers, targets.tolerances, *row_errors)
             hand, arm = HandFit(bool(hand_fits.ok[row]), contacts), None
             if hand.fits and self._arm is not None:
                 arm = ArmReach(

@@ -19,7 +19,7 @@ from casadi_ik.solve.collision_free_search import CollisionFreeResult, Collision
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.solution import BatchSolution
 from casadi_ik.solve.status import Status
-from casadi_ik.solve.verdict import SolvedVerdict, judge_single
+from casadi_ik.solve.verdict import Verdict, judge
 
 DEFAULT_PREFERENCE = "limits"
 """Preference of targets that specify none."""
@@ -158,7 +158,7 @@ def resolve_single(
     query: CollisionQuery,
     q: Array,
     try_other_hands: bool = False,
-) -> tuple[Array, SolvedVerdict, Clearances] | None:
+) -> tuple[Array, Verdict, Clearances] | None:
     """Return a collision-free configuration with the hand of a single solution.
 
     The result equals that of `resolve_collisions`, which tries this hand first.
@@ -180,9 +180,7 @@ def resolve_single(
             search.try_hands(hands, target_index)
     if not search.free[0]:
         return None
-    solution = search.best[0]
-    verdict = judge_single(finder.robot, targets, solution)
-    if verdict is None:
-        return None
-    clearances = query.check(solution[None])
-    return (solution, verdict, clearances) if clearances.free[0] else None
+    q = search.best[:1]
+    verdict, clearances = judge(finder.robot, targets, q), query.check(q)
+    is_solved = verdict.solved(targets.enforce_limits)[0] and clearances.free[0]
+    return (q[0], verdict, clearances) if is_solved else None

@@ -30,7 +30,6 @@ from casadi_ik.solve.subproblems import LocalRefinement, SubproblemSolver
 from casadi_ik.solve.verdict import (
     ContactVerdict,
     Verdict,
-    contact_verdicts,
     deviations,
     judge,
     judge_palms,
@@ -230,16 +229,11 @@ class Diagnostician:
             other_fingers = [i for i in range(len(robot.fingers)) if i not in fingers]
             side_targets = _with_free_fingers(targets.rows(rows), other_fingers)
             search = self._search(side_targets, best.rows(rows), *DIAGNOSIS_EFFORT.side_search)
-            position, angle, met = (
-                getattr(judge(robot, side_targets, search.minimax_q), array)
-                for array in ("position_error", "angle_error", "ok")
-            )
-            verdicts = contact_verdicts(
-                robot.fingers, side_targets.tolerances, position, angle, met
-            )
-            for row, of_fingers in zip(rows.tolist(), verdicts, strict=True):
+            verdict = judge(robot, side_targets, search.minimax_q)
+            for i, row in enumerate(rows.tolist()):
+                contacts = verdict.contacts(i, robot.fingers, side_targets.tolerances)
                 by_target[row][name] = max(
-                    (of_fingers[robot.fingers[i]] for i in fingers),
+                    (contacts[robot.fingers[finger]] for finger in fingers),
                     key=lambda verdict: (not verdict.ok, verdict.position_error),
                 )
         return by_target

@@ -39,13 +39,13 @@ from casadi_ik.solve.solution import BatchSolution, Solution
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.subproblems import SubproblemSolver
 from casadi_ik.solve.turns import in_nearest_turns, with_search_starts
-from casadi_ik.solve.verdict import construct_unchecked, judge_errors, judge_single
+from casadi_ik.solve.verdict import contact_verdicts
 
 LOCAL = "local"
 """Best effort that stays near the start."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(slots=True, eq=False)
 class SolveOptions:
     """Options of a solve that do not change the solutions of its targets, except `best_effort`.
 
@@ -71,7 +71,7 @@ class SolveOptions:
             )
         if not isinstance(self.jobs, (int, np.integer)) or self.jobs < 1:
             raise InputError(f"jobs: found {self.jobs!r}, expected an integer >= 1")
-        object.__setattr__(self, "jobs", int(self.jobs))
+        self.jobs = int(self.jobs)
 
 
 REQUIRED_ARRAYS = ("points", "normals")
@@ -174,8 +174,9 @@ class Engine:
         kinds = self.kinds or point_normal_kinds(len(self.robot.fingers))
         return NearestSearch(SubproblemSolver(self.robot, method), kinds, self.compiled)
 
-    def _require_hand_search(self) -> HandSearch:
-        """Return the method as a hand search, ready to run.
+    @cached_property
+    def _prepared_hand_search(self) -> HandSearch:
+        """The method as a hand search, built and compiled.
 
         Raises:
             UnsupportedError: The method is a black box.
@@ -196,7 +197,7 @@ class Engine:
         Raises:
             UnsupportedError: The method finds a single solution.
         """
-        return AlternativeFinder(self.robot, self._require_hand_search(), self.compiled)
+        return AlternativeFinder(self.robot, self._prepared_hand_search, self.compiled)
 
     @cached_property
     def sensitivity(self) -> SensitivityKernel:
@@ -234,36 +235,31 @@ class Engine:
             interim = self._interim_solver.solve(targets, self.check)
             if interim is not None:
                 return interim
-            method.prepare()
+            method = self._prepared_hand_search
             started = time.perf_counter()
             single = method.solve_single(targets)
             if single is not None:
-                solution = self._single_solution(targets, single, started)
-                if solution is not None:
-                    return solution
+                if single.status == Status.SOLVED:
+                    solution = self._single_solution(targets, single, started)
+                    if solution is not None:
+                        return solution
                 outcome = single.outcome(time.perf_counter() - started)
         return self.solve(targets, options, outcome).solution(0)
 
     def _single_solution(
         self, targets: TargetBatch, outcome: SingleOutcome, started: float
     ) -> Solution | None:
-        """Return the solution of one target if its outcome passes the verdict and is free.
+        """Return the solution of one solved target; None if it needs a collision-free search.
 
         Args:
             targets: One target.
-            outcome: Result of the method.
+            outcome: Result of the method with status SOLVED.
             started: Start of the solve [s], as `time.perf_counter` counts.
         """
-        if outcome.status != Status.SOLVED:
-            return None
-        robot, seconds = self.robot, time.perf_counter() - started
-        if outcome.errors is None:
-            verdict = judge_single(robot, targets, outcome.q)
-        else:
-            verdict = judge_errors(targets, *outcome.errors)
-        if verdict is None:
-            return None
-        q, distance, pair = outcome.q, None, None
+        robot, q, clearances = self.robot, outcome.q, None
+        errors = outcome.position_error, outcome.angle_error, (True,) * len(robot.fingers)
+        contacts = contact_verdicts(robot.fingers, targets.tolerances, *errors)
+        limits_ok = outcome.limits_ok
         if (query := self.collision_query(targets)) is not None:
             clearances = query.check(q[None])
             if not clearances.free[0]:
@@ -272,25 +268,24 @@ class Engine:
                 if free is None:
                     return None
                 q, verdict, clearances = free
+                contacts = verdict.contacts(0, robot.fingers, targets.tolerances)
+                limits_ok = bool(verdict.limits_ok[0])
                 (q,) = in_nearest_turns(robot.description, targets, q[None])
-                seconds = time.perf_counter() - started
-            distance, pair = float(clearances.distance[0]), clearances.pair(0)
-        return construct_unchecked(
-            Solution,
+        return Solution(
             success=True,
             status=Status.SOLVED,
             q=q,
             iterations=outcome.iterations,
             restarts=outcome.restarts,
-            time=seconds,
-            contacts=dict(zip(robot.fingers, verdict.contacts, strict=True)),
+            time=time.perf_counter() - started,
+            contacts=contacts,
             phases=outcome.phases,
-            limits_ok=verdict.limits_ok,
+            limits_ok=limits_ok,
             method=self.method.name,
             robot=robot.name,
             actuators=robot.actuators,
-            clearance=distance,
-            closest=pair,
+            clearance=None if clearances is None else float(clearances.distance[0]),
+            closest=None if clearances is None else clearances.pair(0),
             arm_hand=robot,
         )
 
@@ -308,7 +303,7 @@ class Engine:
             InputError: The method does not support the targets.
         """
         if targets.palms is not None:
-            self._require_hand_search()  # no other method keeps the hand of each target
+            _ = self._prepared_hand_search  # no other method keeps the hand of each target
         recorder = options.recorder
         # Build before clock and threads start, so that no solve is charged for it.
         needs_finder = targets.prefer == MANIPULABILITY or self.check is not None

@@ -132,13 +132,16 @@ class Outcome:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(slots=True, eq=False)
 class SingleOutcome:
-    """Result of a method for one target; fields as in `Outcome`.
+    """Result of a method for one target, after the verdict; counts as in `Outcome`.
 
     Attributes:
-        errors: Distances [m] and angles [rad] by finger as the verdict measures them, NaN where
-            free, and the largest limit violation [rad or m]; None: not measured.
+        q: (n,) final configuration [rad or m].
+        status: Code of `Status`; SOLVED if the verdict agrees.
+        position_error: Distance of each fingertip [m], NaN where free.
+        angle_error: Angle of each fingertip [rad], NaN where free.
+        limits_ok: Whether every actuator and joint is within its limits.
     """
 
     q: Array
@@ -146,7 +149,9 @@ class SingleOutcome:
     iterations: int
     restarts: int
     phases: Mapping[str, int]
-    errors: tuple[list[float], list[float], float] | None = None
+    position_error: list[float]
+    angle_error: list[float]
+    limits_ok: bool
 
     def outcome(self, seconds: float) -> Outcome:
         """Return the outcome as a batch of one target that took this many seconds."""

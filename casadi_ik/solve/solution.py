@@ -96,7 +96,7 @@ class CollisionReport:
         return tuple(lines) if self.way_out is None else (*lines, *self.way_out.lines)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(slots=True, eq=False, repr=False)
 class Solution(ReprMixin):
     """The result of solving one grasp.
 
@@ -370,8 +370,8 @@ class BatchSolution(ReprMixin):
             >>> solver.solve_batch(points, normals).solution(0).status.name
             'SOLVED'
         """
-        errors = self.position_error[[row]], self.angle_error[[row]], self.ok[[row]]
-        (contacts,) = contact_verdicts(self.fingers, self.tolerances, *errors)
+        errors = (array[row].tolist() for array in (self.position_error, self.angle_error, self.ok))
+        contacts = contact_verdicts(self.fingers, self.tolerances, *errors)
         return Solution(
             success=bool(self.success[row]),
             status=Status(int(self.status[row])),

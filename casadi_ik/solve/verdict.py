@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +24,7 @@ TOLERANCE_SLACK = 1e-9
 """Relative excess over a tolerance that counts as rounding, so that graphs and verdict agree."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class ContactVerdict:
     """Errors of one finger's contact.
 
@@ -48,19 +47,23 @@ class ContactVerdict:
 
 
 def contact_verdicts(
-    fingers: Sequence[str], tolerances: Sequence[Tolerance], *errors: NDArray[Any]
-) -> list[dict[str, ContactVerdict]]:
-    """Return the verdicts of k configurations by finger.
+    fingers: Sequence[str],
+    tolerances: Sequence[Tolerance],
+    position_error: Sequence[float],
+    angle_error: Sequence[float],
+    ok: Sequence[bool],
+) -> dict[str, ContactVerdict]:
+    """Return the verdict of a configuration by finger.
 
     Args:
         fingers: Names of the fingers.
         tolerances: Tolerance by finger.
-        errors: (k, f) distances [m], angles [rad], and whether they are within tolerance.
+        position_error: Distance of each fingertip [m].
+        angle_error: Angle of each fingertip [rad].
+        ok: True for each finger whose errors are within tolerance.
     """
-    return [
-        dict(zip(fingers, map(ContactVerdict, *row, tolerances), strict=True))
-        for row in zip(*(column.tolist() for column in errors), strict=True)
-    ]
+    columns = zip(position_error, angle_error, ok, tolerances, strict=True)
+    return {name: ContactVerdict(*row) for name, row in zip(fingers, columns, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -127,17 +130,22 @@ class Verdict:
         contacts_ok: NDArray[np.bool_] = np.logical_and.reduce(self.ok, axis=1)
         return contacts_ok
 
+    def contacts(
+        self, row: int, fingers: Sequence[str], tolerances: Sequence[Tolerance]
+    ) -> dict[str, ContactVerdict]:
+        """Return the verdict of a row by finger.
+
+        Args:
+            row: Index of the configuration.
+            fingers: Names of the fingers.
+            tolerances: Tolerance by finger.
+        """
+        errors = (array[row].tolist() for array in (self.position_error, self.angle_error, self.ok))
+        return contact_verdicts(fingers, tolerances, *errors)
+
     def solved(self, limits: bool) -> NDArray[np.bool_]:
         """Return (k,) whether the target is solved, and q within limits if `limits`."""
         return self.all_ok & self.limits_ok if limits else self.all_ok
-
-
-@dataclass(frozen=True, eq=False)
-class SolvedVerdict:
-    """Errors of a configuration that meets all contacts of its target."""
-
-    contacts: Sequence[ContactVerdict]
-    limits_ok: bool
 
 
 def judge(robot: ArmHand, targets: TargetBatch, q: Array) -> Verdict:
@@ -183,55 +191,6 @@ def judge_palms(robot: ArmHand, targets: TargetBatch, q: Array) -> PalmVerdicts 
     tolerance, slack = targets.largest_tolerance, 1 + TOLERANCE_SLACK
     ok = (position <= tolerance.position * slack) & (angle <= tolerance.angle * slack)
     return PalmVerdicts(position, angle, ok)
-
-
-def judge_single(robot: ArmHand, targets: TargetBatch, q: Array) -> SolvedVerdict | None:
-    """Return the verdict of a configuration that solves its target, else None.
-
-    None also stands for a target with free parts; `judge` handles every case.
-
-    Args:
-        robot: The robot.
-        targets: One target.
-        q: (n,) configuration [rad or m].
-    """
-    position, angle, excess = deviations(robot, targets, q)
-    return judge_errors(targets, position.tolist(), angle.tolist(), float(excess))
-
-
-def judge_errors(
-    targets: TargetBatch, position: list[float], angle: list[float], excess: float
-) -> SolvedVerdict | None:
-    """Return the verdict of measured errors if they solve the target, see `judge_single`.
-
-    Args:
-        targets: One target.
-        position: Distances by finger [m].
-        angle: Angles by finger [rad].
-        excess: Largest limit violation of an actuator or joint [rad or m].
-    """
-    limits_ok = excess <= LIMIT_SLACK
-    if targets.enforce_limits and not limits_ok:
-        return None
-    contacts = []
-    slack = 1 + TOLERANCE_SLACK
-    for position_error, angle_error, tolerance in zip(
-        position, angle, targets.tolerances, strict=True
-    ):
-        if not (
-            position_error <= tolerance.position * slack and angle_error <= tolerance.angle * slack
-        ):
-            return None
-        contacts.append(
-            construct_unchecked(
-                ContactVerdict,
-                position_error=position_error,
-                angle_error=angle_error,
-                ok=True,
-                tolerance=tolerance,
-            )
-        )
-    return SolvedVerdict(contacts, limits_ok)
 
 
 def deviations(robot: ArmHand, targets: TargetBatch, q: Array) -> tuple[Array, Array, Array]:
@@ -285,21 +244,3 @@ def _rotation_angle(rotations: Array, targets: Array) -> Array:
     axis = [relative[..., i, j] - relative[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
     cosine = relative[..., 0, 0] + relative[..., 1, 1] + relative[..., 2, 2] - 1
     return np.arctan2(np.linalg.norm(np.stack(axis, axis=-1), axis=-1), cosine)
-
-
-T = TypeVar("T")
-
-
-def construct_unchecked(kind: type[T], **fields: Any) -> T:
-    """Construct a frozen dataclass without calling its `__init__`.
-
-    `__init__` calls `object.__setattr__` for every field, which for the 17 fields of a solution
-    takes as long as a hand fit. Fields are not validated.
-
-    Args:
-        kind: A dataclass without `__post_init__` and slots.
-        fields: Values by field name; fields with a plain default may be omitted.
-    """
-    instance = object.__new__(kind)
-    vars(instance).update(fields)
-    return instance

@@ -26,7 +26,7 @@ from casadi_ik.solve.hand_first.search_code import (
     search_library,
 )
 from casadi_ik.solve.method import Outcome, SingleOutcome
-from casadi_ik.solve.verdict import construct_unchecked
+from casadi_ik.solve.verdict import LIMIT_SLACK
 
 
 class Searches:
@@ -153,23 +153,16 @@ class Searches:
         Args:
             status: Status that the call returned.
         """
-        errors = None
-        if not self.extra_vectors:
-            errors = (
-                self.position_error.tolist(),
-                self.angle_error.tolist(),
-                self._limit_violation.value,
-            )
-        return construct_unchecked(
-            SingleOutcome,
+        counts = map(int, self._counts.tolist())
+        return SingleOutcome(
             q=self.q.copy(),
             status=status,
             iterations=self._iterations.value,
             restarts=self._restarts.value,
-            phases=dict(
-                zip(self.plan.layouts.labels, map(int, self._counts.tolist()), strict=True)
-            ),
-            errors=errors,
+            phases=dict(zip(self.plan.layouts.labels, counts, strict=True)),
+            position_error=self.position_error.tolist(),
+            angle_error=self.angle_error.tolist(),
+            limits_ok=self._limit_violation.value <= LIMIT_SLACK,
         )
 
     def decide(self, status: int, rounds: int) -> bool:

@@ -293,7 +293,23 @@ class HandFirstMethod(LoopedMethod):
         with self._searches.lent(targets.enforce_limits) as search:
             search.set_target(targets, 0, self.terms(targets))
             status = search(self._max_restarts(targets))
-            return None if status is None else search.result(status)
+            if status is None:
+                return None
+            outcome, has_verdict = search.result(status), not search.extra_vectors
+        if not has_verdict:
+            self._judge(targets, outcome)
+        return outcome
+
+    def _judge(self, targets: TargetBatch, outcome: SingleOutcome) -> None:
+        """Set the verdict of a target whose contact vectors the C code does not judge."""
+        verdict = judge(self._arm_hand, targets, outcome.q[None])
+        outcome.position_error = verdict.position_error[0].tolist()
+        outcome.angle_error = verdict.angle_error[0].tolist()
+        outcome.limits_ok = bool(verdict.limits_ok[0])
+        if verdict.solved(targets.enforce_limits)[0]:
+            outcome.status = Status.SOLVED
+        elif outcome.status == Status.SOLVED:
+            outcome.status = Status.STALLED
 
     def new_search(self, enforce_limits: bool) -> Searches | None:
         """Return memory for successive searches; None without a compiler."""
