@@ -18,7 +18,8 @@ import casadi as ca
 import numpy as np
 from matplotlib.axes import Axes
 from runner.figures import COLORS, figure, title
-from runner.report import command, markdown_table, program
+from runner.parts import code_version
+from runner.report import command, markdown_table, program, publish
 
 import casadi_ik as ik
 from casadi_ik.files.arrays import Array
@@ -106,6 +107,9 @@ TABLE_I = {0.1: (-1.37181, -3.89763), 0.5: (-0.196327, -0.373781), 1.0: (-0.5987
 RELATIVE_OFFSET = (5.5, 0.2)
 """Chandra et al. 2019, section III: steady offset in x and y [mm] of their Fig. 5."""
 
+INDEX_GOAL = 0.637
+"""Fraction of every stroke at the goal of the index fingertip's pose."""
+
 INDEX_GAINS = (0.1, 0.5, 1.0)
 RELATIVE_GAINS = (0.1, 0.3, 0.6, 1.0)
 
@@ -125,7 +129,7 @@ def index_pose(
 ) -> str:
     """Figs. 2, 3 and Table I: the index fingertip's pose for several gains."""
     task = ik.papers.ScrewTask("pose", "index")
-    start, goal = within(robot, 0.1), within(robot, 0.637)
+    start, goal = within(robot, 0.1), within(robot, INDEX_GOAL)
     plot, ((path, norms),) = figure(1, 2, 5, 4.2)
     rows, rates = [], []
     random_goals = robot.lower + rng.uniform(0.1, 0.9, (goals, len(start))) * span(robot)
@@ -364,6 +368,27 @@ def requested_part(kind: str, pose: Array, point: Array) -> dict[str, Array]:
     return {name: parts[name] for name in (kind if kind != "position" else "point",)}
 
 
+def main_result(robot: ik.ArmHand, gains: Sequence[float], resolution: float) -> str:
+    """Return the sentence on the final errors of the index fingertip's pose by gain."""
+    task, start = ik.papers.ScrewTask("pose", "index"), within(robot, 0.1)
+    goal = within(robot, INDEX_GOAL)
+    exact, stepped = (
+        [
+            final_distance(control, start, goal, 300)
+            for gain in gains
+            for control in [ik.papers.ScrewControl(robot, task, gain, resolution=step)]
+        ]
+        for step in (0.0, resolution)
+    )
+    printed = [float(np.hypot(*pair)) for pair in TABLE_I.values()]
+    return (
+        f"With exact sliders the index fingertip ends within {max(exact):.1g} mm of its goal for "
+        f"every gain; sliders in steps of {1e3 * resolution:g} mm leave {min(stepped):.2g} to "
+        f"{max(stepped):.2g} mm, and the offsets of the paper's Table I are {min(printed):.2g} to "
+        f"{max(printed):.2g} mm."
+    )
+
+
 CENTRING = (0.0, 0.05, 0.2)
 
 
@@ -392,7 +417,7 @@ def main(arguments: list[str] | None = None) -> None:
     robot = ik.load_robot(options.robot)
     rng = np.random.default_rng(options.seed)
     parts = [
-        INTRODUCTION.format(command=command(__file__, arguments)),
+        INTRODUCTION,
         index_pose(
             *(robot, options.out, options.goals, rng, options.index_gains, options.resolution)
         ),
@@ -400,17 +425,18 @@ def main(arguments: list[str] | None = None) -> None:
         offsets(robot, options.out, options.goals, rng, options.offset_gain),
         null_space(robot, options.goals, rng, options.centring),
     ]
-    (options.out / "report.md").write_text("\n".join(parts), encoding="utf-8")
+    result = main_result(robot, options.index_gains, options.resolution)
+    heading = "Gains and offsets of the screw control law on the AR10"
+    run_by = command(__file__, arguments)
+    publish(heading, result, parts, options.out, run_by, {"ar10_gains": code_version()})
 
 
-INTRODUCTION = """\
-# Gains and offsets of the screw control law on the AR10
-
+INTRODUCTION = """
 Chandra et al. 2019 control the AR10 by `q+ = q - gain J^+ ln(x_c x_d*)` (their eq. 14). This is
 the same law on the published dimensions of the hand, in slider coordinates, one step per unit of
 time. Start, goals and the time between their steps are not published: ours are a start at 10 % of
 every stroke and goals drawn from the strokes, so curves are to be compared in kind, and figures in
-size. Made by `{command}`.
+size.
 """
 
 

@@ -186,11 +186,25 @@ def main(arguments: list[str] | None = None) -> None:
         run_by = command(__file__, arguments)
         for folder, name in ((options.against, "CHECKOUT"), (options.report, "REPORT")):
             run_by = run_by.replace(str(folder), name)
-        publish("Benchmark", parts, options.report, run_by, {"bench": code_version()})
+        result = main_result(rows, options.turns)
+        publish("Benchmark", result, parts, options.report, run_by, {"bench": code_version()})
     if slow:
         sys.exit(
             "\n".join(f"slower than --limit {options.limit:g}: {' '.join(row)}" for row in slow)
         )
+
+
+def main_result(rows: list[list[str]], turns: int) -> str:
+    """Return the sentence on the ratios to the other checkout, or on the number of quantities."""
+    times = [row for row in rows if "us" in row[3].split() and len(row) > 5 and row[-1]]
+    if not times:
+        return f"The least of {turns} turns is stated for {len(rows)} quantities."
+    times.sort(key=lambda row: float(row[-1]))
+    middle, last = times[len(times) // 2], times[-1]
+    return (
+        f"The median of the {len(times)} paired ratios of times is {middle[-1]}, and the largest "
+        f"is {last[-1]} ({', '.join(cell for cell in last[:4] if cell)})."
+    )
 
 
 def slower_rows(rows: list[list[str]], limit: float) -> list[list[str]]:

@@ -92,12 +92,11 @@ def main(arguments: list[str] | None = None) -> None:
     straight = np.abs(elbow) < 10
     bad = condition["paper"] > args.near
     moves = mobility(constraints(robot, q[:1])[0])
+    result = (
+        f"With the active joints of the paper {near_share['paper']:.1f} % of the configurations "
+        f"are near singular; with joints chosen by pivoting {near_share['pivoted']:.2f} %."
+    )
     text = f"""
-# Singularities of the closed chain
-
-**With the active joints of the paper {near_share["paper"]:.1f} % of the configurations are near
-singular; with joints chosen by pivoting {near_share["pivoted"]:.2f} %.**
-
 `{command(__file__, arguments)}`:
 {args.count} configurations of `{robot.name}` uniform within limits; lengths in units of
 {LENGTH} m. The chain of arm, thumb and virtual joint has {len(names)} coordinates and mobility
@@ -121,7 +120,8 @@ mechanism: with the active joints chosen anew by QR with column pivoting
 method `thumb-first` makes none, since its steps along the null space of the thumb's rows need no
 H_p.
 """
-    write(args.out, "closed_chain_singularities", plot, text)
+    name = "Singularities of the closed chain"
+    write(args.out, "closed_chain_singularities", plot, name, result, text)
 
 
 if __name__ == "__main__":

@@ -112,12 +112,11 @@ def main(arguments: list[str] | None = None) -> None:
     plot.colorbar(mesh, ax=grid[1, 1])
 
     low, high = share < 10, share > 90
+    result = (
+        f"Half of the thumb contacts let the arm follow at least {np.median(share):.0f} % of the "
+        "palm poses."
+    )
     text = f"""
-# Workspace of the closed chain
-
-**Half of the thumb contacts let the arm follow at least {np.median(share):.0f} % of the palm
-poses.**
-
 `{command(__file__, arguments)}`:
 {args.count} thumb contacts of `{robot.name}` (from configurations uniform within limits), for each
 {args.palms} palms uniform in virtual joint and thumb joints, the arm in closed form within limits;
@@ -138,7 +137,8 @@ joints allow, and the arm cuts a piece out of it. Of all palms the arm cannot fo
 limits, the others are too far or too near. The paper finds the chain's workspace narrow: so it is
 at the border of the arm's reach, while well inside it most of what the thumb allows is there.
 """
-    write(args.out, "closed_chain_workspace", plot, text)
+    heading = "Workspace of the closed chain"
+    write(args.out, "closed_chain_workspace", plot, heading, result, text)
 
 
 def _smoothed(x: Array, y: Array, hit: NDArray[np.bool_]) -> Array:

@@ -309,8 +309,8 @@ def main(arguments: list[str] | None = None) -> None:
     solved, solvable = (
         sum(int(row[4].split(" of ")[i]) for row in rows) if rows else 0 for i in (0, 1)
     )
+    result = f"Of {solvable:,} targets with a known collision-free solution, {solved:,} are solved."
     body = [
-        f"**Of {solvable:,} targets with a known collision-free solution, {solved:,} are solved.**",
         "## Check",
         "Microseconds a configuration, kinematics included; one core of a busy machine, the least "
         f"of {REPEATS} repeats in one process, so the ratios count.",
@@ -328,7 +328,7 @@ def main(arguments: list[str] | None = None) -> None:
     body += ["## Others", PEERS]
     body += [markdown_table(heads, peers) if peers else "Not run (`studies/peers.txt`)."]
     run_by, code = command(__file__, arguments), {"collision": codes or None}
-    publish(options.title, body, options.report, run_by, code, metrics)
+    publish(options.title, result, body, options.report, run_by, code, metrics)
 
 
 if __name__ == "__main__":

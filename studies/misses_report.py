@@ -341,9 +341,10 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
     total = sum(row["count"] for row in [*rows, *climbed])
     missed_count = sum(len(row["missed"]) for row in [*rows, *climbed])
     result, *tolerances = displaced_table(options, metrics) or [""]
-    body = [result] if result else []
+    body = []
     if total or noise or not result:
-        body += [f"**{total:,} solves, {missed_count} missed.**", INTRODUCTION]
+        result = f"Of {total:,} reachable targets, {missed_count} are missed. {result}".strip()
+        body = [INTRODUCTION]
     options.report.mkdir(parents=True, exist_ok=True)
     if options.ratio and rows and all("+" in row["robot"] for row in rows):
         heat_map(rows, options.report / "pairs.png")
@@ -355,7 +356,7 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
     body += tolerances
     if climbed:
         body += ["## Climbing", CLIMBING, climbed_table(climbed, metrics)]
-    body += causes_section([*rows, *climbed]) if total or not result else []
+    body += causes_section([*rows, *climbed]) if total or not tolerances else []
     if missed_count > MAX_LISTED:
         misses = [
             {"robot": row["robot"], "kind": row["kind"], "tolerance": row["tolerance"]}
@@ -365,4 +366,4 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
         ]
         pl.DataFrame(misses).write_csv(options.report / "misses.csv")
     code = ", ".join(sorted({codes, climbed_codes} - {""})) or None
-    publish(options.title, body, options.report, run_by, {"misses": code}, metrics)
+    publish(options.title, result, body, options.report, run_by, {"misses": code}, metrics)

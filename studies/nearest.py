@@ -129,11 +129,10 @@ def main(arguments: list[str] | None = None) -> None:
     introduction = INTRODUCTION.format(step=1e3 * options.step)
     largest = max(float(row[-1]) for row in steps if row[1] == "q0")
     result = (
-        f"**With preference q0, no motor moves more than {largest:.2f} deg between contacts "
-        f"{1e3 * options.step:g} mm apart.**"
+        f"With preference q0, no motor moves more than {largest:.2f} deg between contacts "
+        f"{1e3 * options.step:g} mm apart."
     )
     parts = [
-        result,
         introduction,
         f"Seed {options.seed}.",
         "## Paths",
@@ -142,7 +141,7 @@ def main(arguments: list[str] | None = None) -> None:
         tables[1],
     ]
     run_by = command(__file__, arguments)
-    publish("Distance to the nearest solution", parts, options.report, run_by)
+    publish("Distance to the nearest solution", result, parts, options.report, run_by)
 
 
 if __name__ == "__main__":

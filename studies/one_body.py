@@ -27,10 +27,8 @@ from runner.report import (
     markdown_table,
     median_metric,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 
 import casadi_ik as ik
@@ -491,6 +489,18 @@ def misses(done: list[tuple[Cell, dict[str, Any]]]) -> tuple[list[list[str]], li
     return rows, metrics
 
 
+def main_result(done: list[tuple[Cell, dict[str, Any]]]) -> str:
+    """Return the sentence on the targets that are missed, by tolerance."""
+    counts: dict[str, tuple[int, int]] = {}
+    for cell, figures in done:
+        if "missed" in figures:
+            missed, count = counts.get(cell.tolerance, (0, 0))
+            counts[cell.tolerance] = missed + figures["missed"], count + cell.count
+    robots = len({cell.robot for cell, _ in done})
+    clauses = [f"{missed:,} of {n:,} at {name}" for name, (missed, n) in counts.items()]
+    return f"Reachable targets of {robots} multi-arm robots that are missed: {', '.join(clauses)}."
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Solve and write the report."""
     parser = argparse.ArgumentParser(description="Several arms on a trunk, solved as one.")
@@ -518,10 +528,9 @@ def main(arguments: list[str] | None = None) -> None:
         parts += [table.title, markdown_table(table.heads, rows)] if rows else []
     if len(done) < len(all_cells):
         parts.append(f"Of {len(all_cells):,} parts {len(done):,} are done so far.")
-    run_by = command(__file__, arguments)
-    parts += ["## Provenance", f"`{run_by}`", provenance({"one_body": codes})]
-    write_page("Several arms as one", parts, options.out)
-    write_metrics(metrics, options.out / "metrics.json")
+    run_by, code = command(__file__, arguments), {"one_body": codes}
+    result = main_result(done)
+    publish("Several arms as one", result, parts, options.out, run_by, code, metrics)
 
 
 if __name__ == "__main__":

@@ -226,8 +226,8 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
             left = [f"{sum(result[key] for result in results_of_case)}" for key in ("hand", "arm")]
             table.append([*cells, *(f"{q:.2f}" for q in quantiles), *left])
     heads = ["robot", "class", "n", "proved %", "median [ms]", "99 % [ms]"]
+    result = f"Of {total:,} reachable targets, {len(listed)} are called unreachable by a proof."
     body = [
-        f"**{total:,} targets, {len(listed)} false proofs.**",
         INTRODUCTION.format(*(f"{x:g}" for x in options.beyond)),
         "## Reachable targets",
         markdown_table(["robot", "targets", "n", "false"], rows),
@@ -236,7 +236,7 @@ def write_report(options: argparse.Namespace, run_by: str) -> None:
         markdown_table([*heads, "not proved: hand", "not proved: arm"], table),
     ]
     code = {"proofs": codes or None}
-    publish(options.title, body, options.report, run_by, code, metrics)
+    publish(options.title, result, body, options.report, run_by, code, metrics)
 
 
 def main(arguments: list[str] | None = None) -> None:

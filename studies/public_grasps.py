@@ -25,10 +25,8 @@ from runner.report import (
     command,
     markdown_table,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 from runner.study import robot_of, standing
 
@@ -173,20 +171,20 @@ def main(arguments: list[str] | None = None) -> None:
     text = INTRODUCTION.format(total=total, objects=len(rows), limit=options.limit)
     free, placed = (sum(int(row[i].split()[0]) for row in rows) for i in (4, 1))
     result = (
-        f"**{100 * free / max(placed, 1):.0f} % of the published grasps can be used by an arm at a "
-        "table without collision.**"
+        f"{100 * free / max(placed, 1):.0f} % of the published grasps can be used by an arm at a "
+        "table without collision."
     )
-    parts = [result, text, markdown_table(heads, rows), "## What is in the way"]
+    parts = [text, markdown_table(heads, rows), "## What is in the way"]
     parts += [
         markdown_table(
             ["first pair that touches, or status", "published grasps"],
             [[a, str(n)] for a, n in causes.most_common(12)],
         )
     ]
-    parts += ["## As published", PUBLISHED, "## Provenance"]
-    parts += [f"`{command(__file__, arguments)}`", provenance({"public grasps": codes})]
-    write_page("Published grasps with an arm and a table", parts, options.out)
-    write_metrics(metrics, options.out / "metrics.json")
+    parts += ["## As published", PUBLISHED]
+    run_by, code = command(__file__, arguments), {"public grasps": codes}
+    heading = "Published grasps with an arm and a table"
+    publish(heading, result, parts, options.out, run_by, code, metrics)
 
 
 if __name__ == "__main__":

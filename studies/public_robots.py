@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from runner.figures import RESULTS
-from runner.report import command, markdown_table, program, write_page
+from runner.parts import code_version
+from runner.report import command, markdown_table, program, publish
 
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.progress import progress
@@ -91,8 +92,8 @@ def key(row: dict[str, str]) -> str:
 
 def report(
     rows: list[dict[str, str]], results: dict[str, dict[str, Any]], shapes: bool
-) -> list[str]:
-    """Return the blocks of the page."""
+) -> tuple[str, list[str]]:
+    """Return the result sentence and the blocks of the report."""
     present = [row for row in rows if key(row) in results]
     times = sorted(results[key(row)]["seconds"] for row in present)
     right = sum(results[key(row)]["outcome"] == row["expected"] for row in present)
@@ -117,10 +118,10 @@ def report(
     ]
     heads = ["repository", "description", "expected structure", "found"]
     result = (
-        f"**{right} of {len(present)} public descriptions are imported without options with the "
-        "expected structure.**"
+        f"{right} of {len(present)} public descriptions are imported without options with the "
+        "expected structure."
     )
-    return [result, text, markdown_table(heads, lines)]
+    return result, [text, markdown_table(heads, lines)]
 
 
 def main() -> None:
@@ -152,9 +153,9 @@ def main() -> None:
             move(1)
     if not results:
         raise SystemExit(f"{options.folder}: has no checkout of a repository of {TABLE.name}")
-    parts = [*report(rows, results, options.shapes), "## Provenance"]
-    parts.append(f"`{command(__file__, None)}`")
-    write_page("Public robot descriptions", parts, RESULTS / "public_robots")
+    result, parts = report(rows, results, options.shapes)
+    run_by, folder = command(__file__, None), RESULTS / "public_robots"
+    publish("Public robot descriptions", result, parts, folder, run_by, {"import": code_version()})
 
 
 if __name__ == "__main__":

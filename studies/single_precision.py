@@ -137,13 +137,13 @@ def main(arguments: list[str] | None = None) -> None:
     lost_count, false_count = (sum(int(row[i].replace(",", "")) for row in rows) for i in (5, 7))
     count = options.count * len(rows)
     result = (
-        f"**Of {count:,} reachable targets, single precision misses {lost_count:,} that double "
-        f"precision solves, and {false_count:,} of its solutions are wrong.**"
+        f"Of {count:,} reachable targets, single precision misses {lost_count:,} that double "
+        f"precision solves, and {false_count:,} of its solutions are wrong."
     )
-    parts = [result, text, markdown_table(heads, rows)]
+    parts = [text, markdown_table(heads, rows)]
     run_by = command(__file__, arguments)
     code = {"single_precision": code_version()}
-    publish("Exported solver in single precision", parts, options.report, run_by, code)
+    publish("Exported solver in single precision", result, parts, options.report, run_by, code)
 
 
 if __name__ == "__main__":

@@ -35,10 +35,8 @@ from runner.report import (
     markdown_table,
     median_metric,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 from runner.study import robot_of, standing
 from scipy.optimize import linprog
@@ -305,8 +303,8 @@ def main(arguments: list[str] | None = None) -> None:
     names = ", ".join(Path(name).stem for name in options.objects)
     texts = {"objects": len(options.objects), "names": names, "limit": options.limit}
     poses, failed = (sum(int(row[i]) for row in rows) for i in (1, 2))
-    result = f"**Grasps are found for {poses - failed:,} of {poses:,} object poses.**"
-    parts = [result, INTRODUCTION.format(checked=CHECKED, **texts), markdown_table(heads, rows)]
+    result = f"Grasps are found for {poses - failed:,} of {poses:,} object poses."
+    parts = [INTRODUCTION.format(checked=CHECKED, **texts), markdown_table(heads, rows)]
     if len(done) < len(all_cells):
         parts.append(f"Of {len(all_cells):,} objects at poses {len(done):,} are done so far.")
     reasons = list(causes(done))
@@ -316,10 +314,8 @@ def main(arguments: list[str] | None = None) -> None:
         )
         parts += ["## None found", table]
     parts += ["## Discussion", DISCUSSION] if metrics else []
-    run_command = command(__file__, arguments)
-    parts += ["## Provenance", f"`{run_command}`", provenance({"touch": codes})]
-    write_page("Grasps from meshes", parts, options.out)
-    write_metrics(metrics, options.out / "metrics.json")
+    run_by, code = command(__file__, arguments), {"touch": codes}
+    publish("Grasps from meshes", result, parts, options.out, run_by, code, metrics)
 
 
 if __name__ == "__main__":

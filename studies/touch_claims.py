@@ -28,10 +28,8 @@ from runner.report import (
     command,
     markdown_table,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 from runner.study import robot_of, standing
 from scipy.optimize import linprog
@@ -419,15 +417,14 @@ def main(arguments: list[str] | None = None) -> None:
     sizes = {"meshes": len(options.meshes), "robots": len(options.robots)}
     checks = [check for _, result in done for check in result["violations"]]
     faulty = sum(any(check[claim] for claim in CLAIMS) for check in checks)
-    result = f"**{faulty or 'None'} of {len(checks):,} grasps violates a checked property.**"
+    result = f"{faulty or 'None'} of {len(checks):,} grasps violates a checked property."
     introduction = INTRODUCTION.format(limit=options.limit, **sizes)
-    parts = [result, introduction, markdown_table(heads, rows)]
+    parts = [introduction, markdown_table(heads, rows)]
     if len(done) < len(all_cells):
         parts.append(f"Of {len(all_cells):,} meshes before robots {len(done):,} are done so far.")
-    parts += ["## Reproduction", f"`{command(__file__, arguments)}`"]
-    parts.append(provenance({"touch_claims": codes}))
-    write_page("Checked properties of grasps from meshes", parts, options.out)
-    write_metrics(metrics, options.out / "metrics.json")
+    run_by, code = command(__file__, arguments), {"touch_claims": codes}
+    heading = "Checked properties of grasps from meshes"
+    publish(heading, result, parts, options.out, run_by, code, metrics)
 
 
 if __name__ == "__main__":

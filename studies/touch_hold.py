@@ -26,15 +26,14 @@ from typing import Any
 import numpy as np
 from rich.progress import track
 from runner.figures import RESULTS
+from runner.parts import code_version
 from runner.report import (
     Metric,
     command,
     markdown_table,
     program,
-    provenance,
+    publish,
     rate_metric,
-    write_metrics,
-    write_page,
 )
 from runner.study import robot_of, standing
 
@@ -130,8 +129,8 @@ def main(arguments: list[str] | None = None) -> None:
             objects.append([robot, name_of(surface), str(len(is_held)), str(sum(is_held))])
     heads = ["robot", "best", "held", "best third held", "any", "held", "AUC of load"]
     third_held, third = (sum(int(row[3].split(" of ")[i]) for row in rows) for i in (0, 1))
+    result = f"{third_held} of {third} grasps in the best third by load hold the object."
     parts = [
-        f"**{third_held} of {third} grasps in the best third by load hold the object.**",
         INTRODUCTION.format(names=names, **vars(options)),
         markdown_table([*heads, "AUC of closure", "strong", "of them held"], rows),
         "## Noise",
@@ -139,11 +138,9 @@ def main(arguments: list[str] | None = None) -> None:
         markdown_table(["robot", "robustness", "held", "AUC of robustness", "AUC of load"], noisy),
         "## The best by object",
         markdown_table(["robot", "object", "grasps", "held"], objects),
-        f"## Provenance\n\n`{command(__file__, arguments)}`",
-        provenance({}),
     ]
-    write_page(options.title, parts, options.out)
-    write_metrics(metrics, options.out / "metrics.json")
+    run_by, code = command(__file__, arguments), {"touch_hold": code_version()}
+    publish(options.title, result, parts, options.out, run_by, code, metrics)
 
 
 def name_of(surface: ik.Surface) -> str:

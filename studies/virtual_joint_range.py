@@ -96,12 +96,11 @@ def main(arguments: list[str] | None = None) -> None:
         return " | ".join(f"{v:.0f}" for v in np.percentile(values, [5, 25, 50, 75, 95]))
 
     is_outer = r > np.quantile(r, 0.75)
+    result = (
+        "The arm lets half of the configurations turn the virtual joint by at least "
+        f"{np.median(width):.0f} deg."
+    )
     text = f"""
-# Range of the virtual joint
-
-**The arm lets half of the configurations turn the virtual joint by at least
-{np.median(width):.0f} deg.**
-
 `{command(__file__, arguments)}`:
 {args.count} arms of `{robot.name}` uniform within limits, the hand at home; the palm is turned
 about the thumb's contact normal in steps of {360 / args.steps:g} deg, the arm follows in closed
@@ -121,7 +120,7 @@ in the rest {np.median(width[~is_outer]):.0f} deg. Beyond a gap there is more to
 {100 * np.mean(total_width > width + 1):.1f} % of the arms: elsewhere the usable turns are
 one piece, though the arm may have to change its branch within it.
 """
-    write(args.out, "virtual_joint_range", plot, text)
+    write(args.out, "virtual_joint_range", plot, "Range of the virtual joint", result, text)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from matplotlib.collections import QuadMesh
 from casadi_ik.app.drawing.palette import FAINT, INK
 from casadi_ik.app.pictures.charts import new_figure
 from casadi_ik.files.arrays import Array
+from runner.report import page
 
 RESULTS = Path(__file__).parents[1] / "results"
 
@@ -73,11 +74,21 @@ def options(
     return parser.parse_args(arguments)
 
 
-def write(folder: Path, name: str, plot: Any, text: str) -> None:
-    """Write ``name/README.md`` and its picture, and say where."""
+def write(folder: Path, name: str, plot: Any, heading: str, result: str, text: str) -> None:
+    """Write ``name/README.md`` with a picture, and print its path and text.
+
+    Args:
+        folder: Folder of the results of all studies.
+        name: Name of the study.
+        plot: Figure of the page.
+        heading: Title of the page.
+        result: Sentence that states the main result.
+        text: Markdown.
+    """
     place = folder / name
     place.mkdir(parents=True, exist_ok=True)
     plot.tight_layout()
     plot.savefig(place / f"{name}.png")
-    (place / "README.md").write_text(text.strip() + f"\n\n![{name}]({name}.png)\n")
-    print(f"{place / 'README.md'}\n\n{text.strip()}")
+    text = page(heading, result, [text, f"![{name}]({name}.png)"])
+    (place / "README.md").write_text(text, encoding="utf-8")
+    print(f"{place / 'README.md'}\n\n{text}")

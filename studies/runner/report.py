@@ -131,39 +131,35 @@ def column_groups(rows: Sequence[Sequence[str]], count: int) -> list[list[int]]:
     return [[*range(keys), *group.tolist()] for group in groups]
 
 
-def write_page(title: str, parts: Sequence[str], folder: Path) -> None:
-    """Write `report.md`.
-
-    Args:
-        title: Title of the page.
-        parts: Markdown, one block after the other; figures by names in the folder.
-        folder: Where it goes; made if it is not there.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    text = "\n\n".join((f"# {title}", *(part.strip() for part in parts))) + "\n"
-    (folder / "report.md").write_text(text, encoding="utf-8")
+def page(title: str, result: str, parts: Sequence[str]) -> str:
+    """Return the text of a report: its title, its result in bold, and Markdown blocks."""
+    return "\n\n".join((f"# {title}", f"**{result}**", *(part.strip() for part in parts))) + "\n"
 
 
 def publish(
     title: str,
+    result: str,
     parts: Sequence[str],
     folder: Path,
     run_by: str,
     code: Mapping[str, str | None] | None = None,
     metrics: Iterable[Metric] = (),
 ) -> None:
-    """Write a page that ends with where it comes from, and its figures as `metrics.json`.
+    """Write `report.md`, which ends with its provenance, and `metrics.json`.
 
     Args:
         title: Title of the page.
-        parts: Markdown, one block after the other.
-        folder: Where it goes.
-        run_by: The command (`command`).
-        code: See `provenance`.
-        metrics: Figures; without any there is no file of them.
+        result: Sentence that states the main result; computed from the results, so that it stays
+            true when the study is repeated.
+        parts: Markdown blocks; figures by their names in the folder.
+        folder: Folder of the report, created if it does not exist.
+        run_by: Command that made the report, see `command`.
+        code: Versions of the code, see `provenance`.
+        metrics: Metrics to store; without any, no `metrics.json` is written.
     """
+    folder.mkdir(parents=True, exist_ok=True)
     end = ["## Provenance", f"`{run_by}`", provenance(code or {})]
-    write_page(title, [*parts, *end], folder)
+    (folder / "report.md").write_text(page(title, result, [*parts, *end]), encoding="utf-8")
     if figures := list(metrics):
         write_metrics(figures, folder / "metrics.json")
 

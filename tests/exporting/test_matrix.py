@@ -6,7 +6,7 @@ import re
 import shutil
 
 import pytest
-from export_matrix import run_cell
+from export_matrix import Cell, run_cell
 
 pytestmark = pytest.mark.slow
 
@@ -26,8 +26,8 @@ COUNT = 50
 )
 def test_exports_compile_without_warnings_and_answer_as_python(robot, mode):
     """Under sanitizers, with warnings as errors."""
-    cell = run_cell(robot, mode, COUNT)
-    assert cell.status == "pass", cell.message
-    solved = re.search(r"(\d+) solved", cell.message)
+    result = run_cell(Cell(robot, mode, COUNT))
+    assert result["status"] == "pass", result["message"]
+    solved = re.search(r"(\d+) solved", result["message"])
     assert solved is not None
     assert int(solved[1]) > COUNT / 2

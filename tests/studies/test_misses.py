@@ -40,7 +40,7 @@ def test_count_resumes_and_lists_misses(tmp_path):
     misses.main([*arguments, "--count", "80"])
     assert len(list((tmp_path / "kuka_lwr_barrett").rglob("*.json"))) == 2
     text = (tmp_path / "report" / "report.md").read_text()
-    assert "80 solves, 1 missed." in text
+    assert "Of 80 reachable targets, 1 are missed." in text
     assert "| 80 | 1 (1 STALLED) |" in text
     assert "random hands-00000, row 3" in text
     assert "| kuka_lwr_barrett | 5 mm, 3 deg | 1 | 1 |" in text, "it can be solved"

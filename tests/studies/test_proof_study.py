@@ -18,7 +18,7 @@ def test_counts_resume_and_false_proofs_are_listed(tmp_path, monkeypatch):
     files = sorted((out / "ar10").glob("*.json"))
     assert len(files) == len(cases) + len(impossible_targets.CLASSES) - 2
     text = (report / "report.md").read_text()
-    assert f"{6 * len(cases)} targets, 0 false proofs." in text
+    assert f"Of {6 * len(cases)} reachable targets, 0 are called" in text
     path = next(path for path in files if path.name.startswith("corners"))
     stored = json.loads(path.read_text())
     stored["found"]["false"] = [[0.125] * 10]
@@ -26,7 +26,7 @@ def test_counts_resume_and_false_proofs_are_listed(tmp_path, monkeypatch):
     proofs.main([*arguments, "--count", "12"])
     assert len(list((out / "ar10").glob("*.json"))) == len(files) + len(cases)
     text = (report / "report.md").read_text()
-    assert f"{12 * len(cases)} targets, 1 false proofs." in text
+    assert f"Of {12 * len(cases)} reachable targets, 1 are called" in text
     assert "0.125 0.125" in text
 
 

@@ -16,7 +16,8 @@ def test_a_made_up_checkout(tmp_path):
     assert motors == "0+4"
     assert len(fingers) == 2
     row = {"repository": "owner/name", "path": path.name, "arguments": "", "expected": "0+1"}
-    text = "\n".join(public_robots.report([row], {public_robots.key(row): result}, shapes=False))
+    sentence, blocks = public_robots.report([row], {public_robots.key(row): result}, shapes=False)
+    text = "\n".join([sentence, *blocks])
     assert "0 of 1 are as" in " ".join(text.split())
     path.write_text("<robot/>")
     assert public_robots.imported(path, [], shapes=False)["outcome"].startswith("error: ")

@@ -58,10 +58,10 @@ def test_table_one(tmp_path, monkeypatch):
         assert (report / f"{name}.png").stat().st_size > 10_000
     table_one.main(["--count", "0", *common])
     report_again = (report / "report.md").read_text()
-    assert report_again.partition("Made by")[0] == text.partition("Made by")[0], (
+    assert report_again.partition("## Provenance")[0] == text.partition("## Provenance")[0], (
         "only the command differs"
     )
-    assert "--count 0" in report_again.partition("Made by")[2]
+    assert "--count 0" in report_again.partition("## Provenance")[2]
 
 
 def test_every_choice_can_be_built(tmp_path):
