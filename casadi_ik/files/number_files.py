@@ -11,7 +11,7 @@ import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -105,8 +105,39 @@ APPEARANCE_TAGS = ("library_images", "library_effects", "library_materials", "bi
 """COLLADA elements that describe the appearance of a mesh."""
 
 
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """The triangles of a mesh file that have the same colour.
+
+    Attributes:
+        points: (k, 3) vertices.
+        triangles: (t, 3) rows of `points`.
+        color: Colour "#rrggbb"; "" if the file states none.
+    """
+
+    points: Array
+    triangles: NDArray[np.int64]
+    color: str = ""
+
+
+def hex_color(channels: Sequence[float]) -> str:
+    """Return a colour "#rrggbb" of channels between 0 and 1: red, green, blue, and others."""
+    return "#" + "".join(f"{round(255 * min(max(c, 0.0), 1.0)):02x}" for c in channels[:3])
+
+
 def read_mesh(path: Path, location: str) -> tuple[Array, NDArray[np.int64]]:
     """Return the vertices (k, 3) and triangles (t, 3) of a mesh file, its parts combined.
+
+    The arguments and exceptions are those of `read_mesh_parts`.
+    """
+    parts = read_mesh_parts(path, location)
+    offsets = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
+    triangles = [part.triangles + offset for part, offset in zip(parts, offsets, strict=True)]
+    return np.concatenate([part.points for part in parts]), np.concatenate(triangles)
+
+
+def read_mesh_parts(path: Path, location: str) -> list[MeshPart]:
+    """Return the parts of a mesh file, with the colours that a COLLADA file states.
 
     Vertices that no triangle uses are dropped.
 
@@ -129,40 +160,41 @@ def read_mesh(path: Path, location: str) -> tuple[Array, NDArray[np.int64]]:
         )
     data = read_bytes(path, location, scaled_limit(LIMITS.mesh_bytes), RAISE_HINT)
     try:
-        points, triangles = _parse_mesh(data, kind[1:])
+        parts = _parse_mesh(data, kind[1:])
     except MissingExtraError:
         raise
     except Exception as error:  # libraries raise exceptions of any type for damaged files
         reason = " ".join(str(error).split()) or type(error).__name__
         raise DescriptionError(f"{location}: cannot be read: {reason}") from error
-    if len(triangles) > scaled_limit(LIMITS.mesh_faces):
-        hint = raise_hint(len(triangles), LIMITS.mesh_faces)
+    count = sum(len(part.triangles) for part in parts)
+    if count > scaled_limit(LIMITS.mesh_faces):
+        hint = raise_hint(count, LIMITS.mesh_faces)
         expected = f"at most {scaled_limit(LIMITS.mesh_faces)} {hint}"
-        raise DescriptionError(f"{location}: found {len(triangles)} triangles, expected {expected}")
-    if not len(points):
+        raise DescriptionError(f"{location}: found {count} triangles, expected {expected}")
+    if not count:
         raise DescriptionError(f"{location}: the mesh is empty; expected triangles")
     bound = LIMITS.mesh_coordinate
-    if not (np.abs(points) <= bound).all():
+    if not all((np.abs(part.points) <= bound).all() for part in parts):
         raise DescriptionError(
             f"{location}: a vertex is not finite or beyond {bound:g}; expected finite coordinates"
         )
-    return points, triangles
+    return parts
 
 
-def _parse_mesh(data: bytes, kind: str) -> tuple[Array, NDArray[np.int64]]:
+def _parse_mesh(data: bytes, kind: str) -> list[MeshPart]:
     with warnings.catch_warnings(), np.errstate(all="ignore"), _silent("trimesh.util"):
         warnings.simplefilter("ignore")
-        parts = _read_collada(data) if kind == "dae" else _read_trimesh(data, kind)
-    points, triangles, count = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
-    for vertices, faces in parts:
+        raw_parts = _read_collada(data) if kind == "dae" else _read_trimesh(data, kind)
+    parts = []
+    for vertices, faces, color in raw_parts:
         # Files may keep vertices of triangles that were deleted.
         indices, numbers = np.unique(np.asarray(faces, dtype=np.int64), return_inverse=True)
         if len(indices) and not 0 <= indices[0] <= indices[-1] < len(vertices):
             raise ValueError("a triangle refers to a vertex that does not exist")
-        points.append(np.asarray(vertices, dtype=np.float64)[indices])
-        triangles.append(numbers.reshape(-1, 3) + count)
-        count += len(indices)
-    return np.concatenate(points), np.concatenate(triangles)
+        points = np.asarray(vertices, dtype=np.float64)[indices]
+        if len(indices):
+            parts.append(MeshPart(points, numbers.reshape(-1, 3), color))
+    return parts
 
 
 @contextlib.contextmanager
@@ -176,37 +208,57 @@ def _silent(logger: str) -> Iterator[None]:
         log.disabled = previous
 
 
-def _read_trimesh(data: bytes, kind: str) -> list[tuple[Any, Any]]:
+def _read_trimesh(data: bytes, kind: str) -> list[tuple[Any, Any, str]]:
     with optional_import("meshes"):
         import trimesh
 
     library: Any = trimesh
     scene = library.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True)
-    return [(mesh.vertices, mesh.faces) for mesh in scene.dump() if hasattr(mesh, "faces")]
+    return [(mesh.vertices, mesh.faces, "") for mesh in scene.dump() if hasattr(mesh, "faces")]
 
 
-def _read_collada(data: bytes) -> list[tuple[Any, Any]]:
+def _read_collada(data: bytes) -> list[tuple[Any, Any, str]]:
     """Return the geometries of a COLLADA scene in metres, with the poses of the scene applied."""
+    meshes = _collada_geometries(data, strict=True)
+    if meshes is None:  # an error in the appearance must not make the geometry unreadable
+        root = ElementTree.fromstring(data)
+        for parent in list(root.iter()):
+            for child in list(parent):
+                if child.tag.rpartition("}")[2] in APPEARANCE_TAGS:
+                    parent.remove(child)
+        meshes = _collada_geometries(ElementTree.tostring(root), strict=False)
+    return meshes or []
+
+
+def _collada_geometries(data: bytes, strict: bool) -> list[tuple[Any, Any, str]] | None:
+    """Return the geometries of a COLLADA scene; None if it has an error and `strict` is True."""
     with optional_import("COLLADA meshes"):
         import collada
 
     library: Any = collada
-    root = ElementTree.fromstring(data)
-    for parent in list(root.iter()):
-        for child in list(parent):
-            # An error in the appearance must not make the geometry unreadable.
-            if child.tag.rpartition("}")[2] in APPEARANCE_TAGS:
-                parent.remove(child)
-    geometry_only = io.BytesIO(ElementTree.tostring(root))
-    document = library.Collada(geometry_only, ignore=[library.common.DaeError])
+    try:
+        document = library.Collada(io.BytesIO(data), ignore=[library.common.DaeError])
+    except Exception:
+        if strict:
+            return None
+        raise
+    if strict and document.errors:
+        return None
     unit = document.assetInfo.unitmeter or 1.0
-    meshes: list[tuple[Any, Any]] = []
+    meshes: list[tuple[Any, Any, str]] = []
     for geometry in document.scene.objects("geometry") if document.scene else ():
         for primitive in geometry.primitives():
             faces = primitive.triangleset() if hasattr(primitive, "triangleset") else primitive
             if isinstance(faces, library.triangleset.BoundTriangleSet) and faces.vertex is not None:
-                meshes.append((unit * faces.vertex, faces.vertex_index))
+                color = _collada_color(primitive.material)
+                meshes.append((unit * faces.vertex, faces.vertex_index, color))
     return meshes
+
+
+def _collada_color(material: Any) -> str:
+    """Return the diffuse colour of a COLLADA material; "" if it is missing or a texture."""
+    diffuse = getattr(getattr(material, "effect", None), "diffuse", None)
+    return hex_color(diffuse) if isinstance(diffuse, tuple) and len(diffuse) >= 3 else ""
 
 
 PLY_TYPES = {

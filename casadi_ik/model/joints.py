@@ -99,6 +99,25 @@ class TypedEdge(TreeEdge, Protocol):
         ...
 
 
+class PlacedEdge(TypedEdge, Protocol):
+    """A joint with the geometry that forward kinematics needs."""
+
+    @property
+    def name(self) -> str:
+        """Name of the joint."""
+        ...
+
+    @property
+    def placement(self) -> Array:
+        """(4, 4) pose of the child link in the parent link at position zero."""
+        ...
+
+    @property
+    def axis(self) -> Array:
+        """(3,) unit axis in the frame of the child link."""
+        ...
+
+
 L = TypeVar("L", bound=TreeEdge)
 J = TypeVar("J", bound=TypedEdge)
 J_co = TypeVar("J_co", bound=TypedEdge, covariant=True)
@@ -229,7 +248,7 @@ def joint_positions(joints: Iterable[Joint], motors: Mapping[str, ArrayLike]) ->
 
 
 def link_poses(
-    root: str, joints: Iterable[Joint], values: Mapping[str, ArrayLike]
+    root: str, joints: Iterable[PlacedEdge], values: Mapping[str, ArrayLike]
 ) -> dict[str, Array]:
     """Return the poses of links in the root's frame by name.
 
@@ -256,7 +275,7 @@ def joint_motion(kind: str, axis: Array, positions: ArrayLike) -> Array:
     pose = np.zeros((*value.shape[:-2], 4, 4)) + np.eye(4)
     if kind == "prismatic":
         pose[..., :3, 3] = value[..., 0] * axis
-    elif kind == "revolute":
+    elif kind in ("revolute", "continuous"):
         # Rodrigues' formula.
         x, y, z = axis
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

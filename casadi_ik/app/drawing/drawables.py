@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -19,27 +18,24 @@ from casadi_ik.app.drawing.surfaces import (
     Shape,
     arrow,
     ball,
-    decimate,
     drum,
     join_surfaces,
     mesh_shape,
     ring,
     rod,
 )
+from casadi_ik.app.drawing.visual_meshes import visual_meshes
 from casadi_ik.collision.clearance import ClosestPoints
 from casadi_ik.collision.model import robot_solids
 from casadi_ik.collision.scene import Obstacle, Scene
 from casadi_ik.collision.solids import Solid
-from casadi_ik.errors import CasadiIKError, UnknownNameError
+from casadi_ik.errors import UnknownNameError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.reading import read_yaml
-from casadi_ik.integrations.importing.meshes import IndexedMesh, link_meshes
-from casadi_ik.integrations.importing.robot_import import read_referenced_tree
+from casadi_ik.integrations.importing.meshes import IndexedMesh
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.description import Finger, RobotDescription
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.model.objects import load_object
-from casadi_ik.model.parts import HAND_PREFIX
 from casadi_ik.model.pose import inverse
 
 View = tuple[float, float]
@@ -147,28 +143,29 @@ class Drawable:
 def visual_bodies(robot: ArmHand) -> list[Drawable]:
     """Return the visual geometry of a robot in the frames of its links, with a pad per fingertip.
 
-    Links are drawn as the meshes of the robot's files, otherwise as collision shapes, otherwise as
-    rods to their child joints.
+    Links are drawn as the meshes of the robot's files or of installed packages (see
+    `casadi_ik.app.drawing.visual_meshes`), otherwise as collision shapes, otherwise as rods to
+    their child joints.
 
     Args:
         robot: The robot.
     """
     description, meshes = robot.description, visual_meshes(robot.description)
-    styles = link_styles(description)
-    roles_with_mesh = {styles[link][0] for link in meshes}
+    styles, covered = link_styles(description), meshes.covered_links
     drawables = [
-        _link_drawable(link, mesh_shape(surface), styles) for link, surface in meshes.items()
+        _link_drawable(link, mesh_shape(part.mesh), styles, part.color)
+        for link, parts in meshes.by_link.items()
+        for part in parts
     ]
-    drawables += [
-        drawable for drawable in collision_bodies(robot) if drawable.role not in roles_with_mesh
-    ]
-    drawn_links, links = {drawable.frame for drawable in drawables}, robot.links(robot.home)
+    drawables += [body for body in collision_bodies(robot) if body.frame not in covered]
+    drawn_links = covered | {drawable.frame for drawable in drawables}
+    links = robot.links(robot.home)
     for joint in description.joints:
-        role, end = styles[joint.parent][0], inverse(links[joint.parent]) @ links[joint.child]
-        if role not in roles_with_mesh and joint.parent not in drawn_links:
+        if joint.parent not in drawn_links:
+            role, end = styles[joint.parent][0], inverse(links[joint.parent]) @ links[joint.child]
             drawables.append(_link_drawable(joint.parent, _link_rod(end[:3, 3], role), styles))
     for finger in description.fingers:
-        if styles[finger.link][0] not in roles_with_mesh and finger.link not in drawn_links:
+        if finger.link not in drawn_links:
             drawables.append(
                 _link_drawable(finger.link, _link_rod(finger.placement[:3, 3], "hand"), styles)
             )
@@ -241,9 +238,11 @@ def link_styles(description: RobotDescription) -> dict[str, tuple[str, str]]:
     return {link: (role, colors[role][depth[link] % 2]) for link, role in roles.items()}
 
 
-def _link_drawable(link: str, shape: Shape, styles: Mapping[str, tuple[str, str]]) -> Drawable:
+def _link_drawable(
+    link: str, shape: Shape, styles: Mapping[str, tuple[str, str]], file_color: str = ""
+) -> Drawable:
     role, color = styles[link]
-    return Drawable(link, shape, color, link, role)
+    return Drawable(link, shape, file_color or color, link, role)
 
 
 def _link_rod(end: Array, role: str) -> Shape:
@@ -258,47 +257,6 @@ def _pad(finger: Finger) -> Drawable:
     center = finger.placement[:3, 3] - 0.13 * radius * normal
     pad = drum(center, normal, 0.62 * radius, 0.36 * radius)
     return Drawable(f"pad {finger.name}", pad, palette.PAD, finger.link, "pad")
-
-
-@lru_cache(maxsize=8)
-def visual_meshes(description: RobotDescription) -> dict[str, IndexedMesh]:
-    """Return by link the visual meshes of the robot's files, decimated for drawing."""
-    try:
-        meshes = {} if description.path is None else file_meshes(description, visual=True)
-    except CasadiIKError:  # the robot can be drawn without its mesh files
-        return {}
-    return {link: decimate(mesh) for link, mesh in meshes.items() if len(mesh.triangles)}
-
-
-def file_meshes(description: RobotDescription, visual: bool = False) -> dict[str, IndexedMesh]:
-    """Return the meshes of the files that a description refers to.
-
-    Args:
-        description: Description that was read from a file.
-        visual: Read the visual meshes instead of the collision meshes.
-
-    Returns:
-        Mesh by link, in the frame of the link; links without a mesh are omitted.
-
-    Raises:
-        CasadiIKError: A file cannot be read.
-    """
-    path = description.path
-    assert path is not None
-    raw, links = read_yaml(path), set(description.links)
-    meshes: dict[str, IndexedMesh] = {}
-    for key in ("arm", "hand", "robot"):
-        entry = raw.get(key)
-        if not isinstance(entry, dict) or "file" not in entry:
-            continue
-        prefix = HAND_PREFIX if key == "hand" else ""
-        # The hand's links are prefixed where arm and hand have a name in common.
-        link_names = {link.removeprefix(prefix) if prefix else link: link for link in links}
-        link_names |= {link: link for link in links if f"{prefix}{link}" not in links or not prefix}
-        surfaces, _ = link_meshes(read_referenced_tree(path, entry), list(link_names), visual)
-        for link, surface in surfaces.items():
-            meshes.setdefault(link_names[link], surface)
-    return meshes
 
 
 # Contacts.

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.app.drawing.drawables import file_meshes
+from casadi_ik.app.drawing.surfaces import join_surfaces
+from casadi_ik.app.drawing.visual_meshes import file_mesh_parts
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import DescriptionError, InputError, optional_import
 from casadi_ik.files.reading import read_yaml
@@ -199,7 +200,10 @@ def view_pads(path: str | PathLike[str], *, host: str = HOST, port: int | None =
     robot = load_robot(file)
     if not isinstance(read_yaml(file).get("fingers"), dict):
         raise DescriptionError(f"{file}: fingers: expected pads by finger")
-    surfaces = file_meshes(robot.description)
+    surfaces = {
+        link: join_surfaces([part.mesh for part in parts])
+        for link, parts in file_mesh_parts(robot.description).items()
+    }
     writable = host in LOOPBACK
     return _start_page(
         serve(host, port, secret=writable),

@@ -12,7 +12,8 @@ import numpy as np
 
 from casadi_ik.api import METHODS
 from casadi_ik.app.drawing import palette
-from casadi_ik.app.drawing.drawables import ground_height, object_drawable, visual_meshes
+from casadi_ik.app.drawing.drawables import ground_height, object_drawable
+from casadi_ik.app.drawing.visual_meshes import visual_meshes
 from casadi_ik.app.viewer.access import Server
 from casadi_ik.app.viewer.camera import Camera, add_lamp, cameras
 from casadi_ik.app.viewer.candidates import CandidateList, Candidates
@@ -572,7 +573,7 @@ class SettingsPanel:
             gui.add_dropdown("Scene", scenes),
             lambda name: page.open(scene="" if name == "none" else str(name)),
         )
-        if visual_meshes(robot.description):  # otherwise both geometries are the same
+        if visual_meshes(robot.description).by_link:  # otherwise both geometries are the same
             on_set(gui.add_dropdown("Show robot as", GEOMETRIES), page.show_geometry)
         page.add_theme_switch()
         on_press(gui.add_button("Save grasp (YAML)", icon=None), self._save_grasp)

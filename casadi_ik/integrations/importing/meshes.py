@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.units import warn_of_large_mesh
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.number_files import read_mesh
+from casadi_ik.files.number_files import hex_color, read_mesh_parts
 from casadi_ik.model.sandbox import package_folders
 from casadi_ik.model.shapes import box_mesh, capsule_mesh, circle, prism_mesh
 from casadi_ik.model.xml_tree import (
@@ -150,10 +150,38 @@ def merge_meshes(meshes: list[IndexedMesh]) -> IndexedMesh | None:
     return IndexedMesh(np.concatenate([mesh.points for mesh in meshes]), np.concatenate(triangles))
 
 
+@dataclass(frozen=True, eq=False)
+class ColoredMesh:
+    """A triangle mesh with a colour "#rrggbb"; "" if its file states none."""
+
+    mesh: IndexedMesh
+    color: str = ""
+
+    def transformed(self, pose: Array) -> ColoredMesh:
+        """Return the mesh in a frame in which the frame of the mesh has a (4, 4) pose."""
+        return replace(self, mesh=self.mesh.transformed(pose))
+
+
 def link_meshes(
     tree: RobotTree, links: Collection[str], visual: bool = False
 ) -> tuple[dict[str, IndexedMesh], list[str]]:
-    """Return the meshes of links, and a message about each file that cannot be read.
+    """Return a mesh for each link, and a message about each file that cannot be read.
+
+    The arguments are those of `link_mesh_parts`.
+    """
+    parts_by_link, messages = link_mesh_parts(tree, links, visual)
+    meshes: dict[str, IndexedMesh] = {}
+    for link, parts in parts_by_link.items():
+        merged = merge_meshes([part.mesh for part in parts])
+        if merged is not None:
+            meshes[link] = merged
+    return meshes, messages
+
+
+def link_mesh_parts(
+    tree: RobotTree, links: Collection[str], visual: bool = False
+) -> tuple[dict[str, list[ColoredMesh]], list[str]]:
+    """Return the coloured meshes of links, and a message about each file that cannot be read.
 
     Args:
         tree: The robot file.
@@ -161,7 +189,7 @@ def link_meshes(
         visual: Whether visual meshes are preferred to collision meshes.
 
     Returns:
-        Mesh by link, in the frame of the link; links without a shape are omitted. Messages, one
+        Meshes by link, in the frame of the link; links without a shape are omitted. Messages, one
         line each.
     """
     if tree.model is not None:
@@ -169,7 +197,7 @@ def link_meshes(
         return {link: mjcf_meshes[link] for link in links if link in mjcf_meshes}, []
     assert tree.element is not None
     problems = MeshProblems(tree.path)
-    meshes: dict[str, IndexedMesh] = {}
+    meshes: dict[str, list[ColoredMesh]] = {}
     for kind in ("visual", "collision") if visual else ("collision", "visual"):
         links_without_mesh = [link for link in links if link not in meshes]
         meshes |= _urdf_meshes(tree.element, kind, links_without_mesh, problems)
@@ -222,50 +250,77 @@ def _count_meshes(names: list[str]) -> str:
 
 def _urdf_meshes(
     element: Element, kind: str, links: Collection[str], problems: MeshProblems
-) -> dict[str, IndexedMesh]:
-    meshes: dict[str, IndexedMesh] = {}
+) -> dict[str, list[ColoredMesh]]:
+    materials = {
+        material.get("name", ""): _material_color(material)
+        for material in element.findall("material")
+    }
+    meshes: dict[str, list[ColoredMesh]] = {}
     for link in element.findall("link"):
         name = link.get("name", "")
         if name in links:
-            parts = [_shape_mesh(shape, problems) for shape in link.findall(kind)]
-            merged = merge_meshes([part for part in parts if part is not None])
-            if merged is not None:
-                meshes[name] = merged
+            shapes = link.findall(kind)
+            parts = [part for shape in shapes for part in _shape_parts(shape, materials, problems)]
+            if parts:
+                meshes[name] = parts
     return meshes
 
 
-def _shape_mesh(shape: Element, problems: MeshProblems) -> IndexedMesh | None:
-    """Return the mesh of an element ``collision`` or ``visual`` in the frame of its link."""
+def _material_color(material: Element | None) -> str:
+    """Return the colour of an element ``material``; "" if it states none."""
+    color = None if material is None else material.find("color")
+    channels = parse_numbers("" if color is None else color.get("rgba", ""))
+    return hex_color(channels) if len(channels) == 4 else ""
+
+
+def _shape_parts(
+    shape: Element, materials: dict[str, str], problems: MeshProblems
+) -> list[ColoredMesh]:
+    """Return the meshes of an element ``collision`` or ``visual`` in the frame of its link.
+
+    The colours of a mesh file take precedence over the material of the element.
+    """
     element, simple, pose = shape.find("geometry/mesh"), simple_shape(shape), origin_pose(shape)
-    mesh = None
+    parts = []
     if element is not None:
-        mesh = _file_mesh(element, problems)
+        parts = _file_parts(element, problems)
     elif simple is not None:
-        mesh = simple_mesh(simple[0], np.array(simple[1]))
-    return None if mesh is None or pose is None else mesh.transformed(pose)
+        parts = [ColoredMesh(simple_mesh(simple[0], np.array(simple[1])))]
+    if pose is None:
+        return []
+    material = shape.find("material")
+    color = _material_color(material)
+    if not color and material is not None:
+        color = materials.get(material.get("name", ""), "")
+    return [replace(part.transformed(pose), color=part.color or color) for part in parts]
 
 
-def _file_mesh(element: Element, problems: MeshProblems) -> IndexedMesh | None:
-    """Return the mesh of the file that an element ``mesh`` names."""
+def _file_parts(element: Element, problems: MeshProblems) -> list[ColoredMesh]:
+    """Return the meshes of the file that an element ``mesh`` names."""
     name = element.get("filename", "")
     file = find_mesh_file(name, problems.path)
     if file is None:
         problems.add_missing(name)
-        return None
+        return []
     scale = parse_numbers(element.get("scale", "1 1 1"))
     try:
-        points, triangles = read_mesh(file, problems.path.name)
+        parts = read_mesh_parts(file, problems.path.name)
     except DescriptionError as error:
         problems.add_error(str(error))
-        return None
-    if len(triangles) > LIMITS.link_triangles:
-        triangles = triangles[:0]
+        return []
     location = f"{problems.path.name}: mesh {name!r}"
     if len(scale) != 3 or max(map(abs, scale)) > LIMITS.mesh_coordinate:
         problems.add_error(f"{location}: scale: expected three finite numbers")
-        return None
-    warn_of_large_mesh(points * scale, location)
-    return IndexedMesh(points * scale, triangles)
+        return []
+    warn_of_large_mesh(np.concatenate([part.points for part in parts]) * scale, location)
+    is_too_fine = sum(len(part.triangles) for part in parts) > LIMITS.link_triangles
+    return [
+        ColoredMesh(
+            IndexedMesh(part.points * scale, part.triangles[: 0 if is_too_fine else None]),
+            part.color,
+        )
+        for part in parts
+    ]
 
 
 def find_mesh_file(name: str, path: Path) -> Path | None:
@@ -301,21 +356,23 @@ def simple_mesh(kind: str, size: Array) -> IndexedMesh:
     return IndexedMesh(*capsule_mesh(size[0], half_length, CIRCLE_POINTS))
 
 
-def _mjcf_meshes(mujoco: Any, model: Any, visual: bool) -> dict[str, IndexedMesh]:
-    parts_by_body: dict[int, list[tuple[bool, IndexedMesh]]] = {}
+def _mjcf_meshes(mujoco: Any, model: Any, visual: bool) -> dict[str, list[ColoredMesh]]:
+    parts_by_body: dict[int, list[tuple[bool, ColoredMesh]]] = {}
     for geom in range(model.ngeom):
         mesh = _geom_mesh(mujoco, model, geom)
         if mesh is None:
             continue
         pose = mjcf_pose(mujoco, model.geom_pos[geom], model.geom_quat[geom])
+        material = int(model.geom_matid[geom])
+        channels = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
+        part = ColoredMesh(mesh.transformed(pose), hex_color(channels))
         parts = parts_by_body.setdefault(int(model.geom_bodyid[geom]), [])
-        parts.append((collides(model, geom), mesh.transformed(pose)))
-    meshes: dict[str, IndexedMesh] = {}
+        parts.append((collides(model, geom), part))
+    meshes: dict[str, list[ColoredMesh]] = {}
     for body, parts in parts_by_body.items():
-        preferred = [mesh for is_solid, mesh in parts if is_solid != visual]
-        merged = merge_meshes(preferred or [mesh for _, mesh in parts])
-        if merged is not None:
-            meshes[model.body(body).name or f"body_{body}"] = merged
+        preferred = [part for is_solid, part in parts if is_solid != visual]
+        name = model.body(body).name or f"body_{body}"
+        meshes[name] = preferred or [part for _, part in parts]
     return meshes
 
 
