@@ -334,7 +334,7 @@ class LoopKernel:
         """Number of lanes in which a batch is solved; 1 without lanes."""
         return 1 if self._lane_loop is None else machine_lanes()
 
-    def _loop_for(self, count: int) -> Any:
+    def loop_for(self, count: int) -> Any:
         """Return the loop with lanes if it pays for a batch of this size, otherwise None."""
         if count < MIN_SOLVES_IN_LANES:
             return None
@@ -476,7 +476,7 @@ class LoopKernel:
 
     def _drive(self, batch: CompiledBatch) -> LoopResult:
         count = len(batch.result.status)
-        result = batch.run(self._loop_for(count), self.entry)
+        result = batch.run(self.loop_for(count), self.entry)
         if count and result.rows is not None:
             self._rows_each = len(result.rows) / count
         return result

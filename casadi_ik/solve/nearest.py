@@ -4,33 +4,32 @@ The distance of a configuration from a target is the sum of its squared contact 
 by its tolerance. Several configurations descend to local minima of this distance, and the nearest
 minimum is returned: the start and the end of the failed solve, and seeds from distinct regions of
 the joint space (`nearest_seeds`). It is the best minimum found; nothing is proved.
+
+The search is C code (compile/runtime/nearest_search.c), which calls the loop of the descent.
 """
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from casadi_ik.collision.clearance import CollisionQuery
-from casadi_ik.compile import RUNNING
-from casadi_ik.compile.graphs import StepGraph, recipe
-from casadi_ik.compile.layout import Field, Layout
-from casadi_ik.compile.loop import LoopKernel
-from casadi_ik.files.arrays import Array, Rows
-from casadi_ik.kinematics.box_qp import normal_equations, solve_box_qp
-from casadi_ik.kinematics.contact_curvature import residual_curvature
-from casadi_ik.kinematics.contact_fit import contact_jacobian, contact_residual
-from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix
-from casadi_ik.kinematics.forward import motor_scales
-from casadi_ik.kinematics.smooth import with_cse
-from casadi_ik.model.description import RobotDescription
+from casadi_ik.compile.cancellation import SLICE, DriverCode, run_cancellable
+from casadi_ik.compile.codegen import WIDE, c_struct, define, driver_text
+from casadi_ik.compile.function_kernel import machine_lanes, memory
+from casadi_ik.compile.graphs import recipe
+from casadi_ik.compile.libraries import load_library
+from casadi_ik.compile.loop import MIN_SOLVES_IN_LANES, NO_LIMIT, SLOTS, UNBEGUN, Job, LoopKernel
+from casadi_ik.files.arrays import Array, Rows, spread_points
+from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.nearest_descent import DESCENT, DescentStep
 from casadi_ik.solve.nearest_seeds import SEED_SETTINGS, SeedSettings, SeedTable
-from casadi_ik.solve.row_selection import first_per_owner, smallest_per_owner
-from casadi_ik.solve.status import Status
+from casadi_ik.solve.row_selection import smallest_per_owner
 from casadi_ik.solve.subproblems import LocalRefinement, SubproblemSolver, residual_tolerances
 
 
@@ -42,14 +41,18 @@ class NearestSettings:
         seeds: Settings of the seeds.
         race_steps: Number of steps that all starts make.
         finalists: Number of starts that continue to the minimum, and additional ones per motor.
-        tie: Relative difference of two distances below which the configuration nearer to the start
+        same: Relative difference of two distances below which one of two starts continues.
+        tie: Relative difference of two minima below which the configuration nearer to the start
             is chosen.
+        chunk_size: Number of targets whose starts are in memory at the same time.
     """
 
     seeds: SeedSettings = SEED_SETTINGS
     race_steps: int = 12
     finalists: tuple[int, int] = (12, 1)
+    same: float = 1e-3
     tie: float = 1e-6
+    chunk_size: int = 32
 
 
 NEAREST_SETTINGS = NearestSettings()
@@ -60,152 +63,141 @@ UNLIMITED_STEP = 1e3
 IN_COLLISION = 1e12
 """Factor of the distance of a configuration in collision, larger than any ratio of distances."""
 
+STARTS_WITHOUT_COMPILER = 32
+"""Number of spread configurations that descend if there is no compiled code."""
 
-@dataclass(frozen=True)
-class DescentParameters:
-    """Parameters of the descent to a local minimum. Source: ``studies/best_effort.py``.
+SEARCH_SYMBOL = "casadi_ik_nearest_search"
+
+FINISH_STAGE, CHOICE_STAGE = 2, 3
+"""Last stages of a search, see compile/runtime/nearest_search.c."""
+
+SearchJob = c_struct("nearest_search_job")
+
+
+def search_code() -> str:
+    """Return the C code of the search; it requires the macro NEAREST_SEARCH, its declaration."""
+    codes = {code.name: int(code) for code in DriverCode}
+    texts = map(driver_text, ("nearest_search_job", "loops", "nearest_search"))
+    return define(codes | {"UNBEGUN": UNBEGUN}) + "".join(texts)
+
+
+def _library_text(is_wide: bool) -> str:
+    """Return the text of the library of the search."""
+    _, _, exported = driver_text("common").partition("#if defined(_WIN32)")
+    export, _, _ = exported.partition("#endif")
+    entry = f"#define NEAREST_SEARCH EXPORT int {SEARCH_SYMBOL}(nearest_search_job *job)\n"
+    return "".join(
+        (
+            WIDE if is_wide else "",
+            "#include <stdint.h>\n#include <string.h>\n",
+            f"#if defined(_WIN32){export}#endif\n",
+            entry,
+            driver_text("loop_job"),
+            search_code(),
+        )
+    )
+
+
+def _load_search() -> Any:
+    """Return the compiled search; None without a compiler."""
+    is_wide = machine_lanes() > 0
+    key = recipe("nearest_search", is_wide)
+    library = load_library("nearest_search", lambda: _library_text(is_wide), SEARCH_SYMBOL, key)
+    return None if library is None else library[SEARCH_SYMBOL]
+
+
+class SearchMemory:
+    """Memory of the search of some targets at a time; not shared by threads.
 
     Attributes:
-        damping: First damping of the normal matrix.
-        damping_floor: Smallest damping.
-        damping_ceiling: Damping at which a rejected step ends the descent.
-        good_gain: Ratio of actual and predicted decrease above which the damping decreases most.
-        poor_gain: Ratio below which the damping increases after an accepted step.
-        good_factor: Factor of the damping after a step with a good gain.
-        fair_factor: Factor of the damping after a step between the two ratios.
-        poor_factor: Factor of the damping after an accepted step with a poor gain.
-        rejected_factor: Factor of the damping after a rejected step.
-        slow: Ratio of distances after and before a step above which steps use the exact second
-            derivatives: Gauss-Newton steps converge slowly where errors remain.
-        settled: Relative decrease of the distance below which a descent has ended.
-        local_step: Longest step of a descent that stays near its start [rad, or part of a slider's
-            range]: long steps would lead to other minima.
-        passes: Number of corrections of the active set in a step.
-        max_iterations: Maximum number of steps.
+        job: Job of the C code, without the data of the targets.
+        states: (capacity, starts, ns) states of the descents.
+        finalists: (capacity, finalists) rows of `states` that descend to their minimum; -1: none.
     """
 
-    damping: float = 1.0
-    damping_floor: float = 1e-12
-    damping_ceiling: float = 1e6
-    good_gain: float = 0.75
-    poor_gain: float = 0.25
-    good_factor: float = 0.2
-    fair_factor: float = 0.7
-    poor_factor: float = 3.0
-    rejected_factor: float = 8.0
-    slow: float = 0.5
-    settled: float = 1e-11
-    local_step: float = 0.1
-    passes: int = 2
-    max_iterations: int = 200
+    def __init__(
+        self, seeds: SeedTable, step: DescentStep, settings: NearestSettings, capacity: int
+    ) -> None:
+        """Allocate the memory.
 
-
-DESCENT = DescentParameters()
-
-
-@dataclass(frozen=True)
-class DescentStep:
-    """Step of the bounded descent of the distance between a robot and its contacts.
-
-    Attributes:
-        robot: Description of the robot.
-        kinds: Kind of contact of each finger.
-    """
-
-    robot: RobotDescription
-    kinds: Kinds
-
-    @cached_property
-    def contacts(self) -> ContactRows:
-        """Rows of the contacts."""
-        return ContactRows(self.kinds)
-
-    @cached_property
-    def state(self) -> Layout:
-        """Layout of the state."""
-        return Layout(
-            (
-                Field("q", (len(self.robot.actuators),), unit="rad or m"),
-                Field("damping", doc="damping of the next step"),
-                Field("is_exact", doc="1: the next step uses exact second derivatives"),
-                Field("distance", doc="half the squared residual after the last step"),
-            )
-        )
-
-    @cached_property
-    def parameters(self) -> Layout:
-        """Layout of the parameters."""
-        n = len(self.robot.actuators)
-        bounds = (Field(name, (n,), unit="rad or m") for name in ("lower", "upper"))
-        max_step = Field("max_step", doc="longest step [rad, or part of a slider's range]")
-        return Layout((*self.contacts.fields, *bounds, max_step))
-
-    @cached_property
-    def graph(self) -> StepGraph:
-        """``(state, parameters) -> (state', record, status)``."""
-        name = ca.Function.fix_name(f"{self.robot.name}_descent{kinds_suffix(self.kinds)}")
-        record = Layout.record(Field("distance", doc="half the squared residual after the step"))
-        key = recipe(name, self.robot, self.kinds)
-        return StepGraph(
-            name, lambda: self._build(name), self.state, self.parameters, record, recipe=key
-        )
-
-    def _build(self, name: str) -> ca.Function:
-        state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
-        s, p = self.state.unpack(state), self.parameters.unpack(parameters)
-        q = ca.SX.sym("q", len(self.robot.actuators))
-        residual = contact_residual(self.robot, self.contacts, q, p)
-        distance = ca.sumsqr(residual) / 2
-        # Structural zeros between motors of different fingers shorten the elimination.
-        jacobian = contact_jacobian(self.robot, self.contacts, q, p)
-        gauss_newton, gradient = normal_equations(jacobian, residual)
-        hessian = gauss_newton + residual_curvature(self.robot, self.contacts, q, p, residual)
-        inputs = [q, parameters]
-        value = ca.Function("distance", inputs, [distance])
-        model = ca.Function("model", inputs, with_cse(distance, gradient, gauss_newton, hessian))
-        distance_before, slope, approximate, exact = model(s["q"], parameters)
-        matrix = ca.if_else(s["is_exact"] > 0.5, exact, approximate)
-        longest = p["max_step"] * motor_scales(self.robot)
-        low = ca.fmax(p["lower"] - s["q"], -longest)
-        high = ca.fmin(p["upper"] - s["q"], longest)
-        step = solve_box_qp(matrix, s["damping"], slope, low, high, DESCENT.passes)
-        trial = s["q"] + ca.fmin(ca.fmax(step, -longest), longest)
-        trial = ca.fmin(ca.fmax(trial, p["lower"]), p["upper"])
-        distance_after = value(trial, parameters)
-        is_accepted = distance_after < distance_before
-        change = trial - s["q"]
-        symmetric = matrix + ca.triu(matrix, False).T
-        predicted_decrease = -ca.dot(change, slope + symmetric @ change / 2)
-        decrease = distance_before - distance_after
-        is_slow = distance_after > DESCENT.slow * distance_before
-        factor = DESCENT.poor_factor
-        for gain, gain_factor in (
-            (DESCENT.poor_gain, DESCENT.fair_factor),
-            (DESCENT.good_gain, DESCENT.good_factor),
-        ):
-            factor = ca.if_else(decrease > gain * predicted_decrease, gain_factor, factor)
-        factor = ca.if_else(is_accepted, factor, DESCENT.rejected_factor)
-        new_state = {
-            "q": ca.if_else(is_accepted, trial, s["q"]),
-            "damping": ca.fmax(s["damping"] * factor, DESCENT.damping_floor),
-            "is_exact": ca.if_else(is_accepted, is_slow, s["is_exact"]),
-            "distance": ca.if_else(is_accepted, distance_after, distance_before),
+        Args:
+            seeds: Tables of postures.
+            step: Step of the descent.
+            settings: Settings of the search.
+            capacity: Number of targets.
+        """
+        tables, robot = seeds.tables, seeds.robot
+        n, n_groups = len(robot.actuators), len(tables.groups)
+        layout, state = step.parameters, step.state
+        n_starts = 2 + tables.n_seeds
+        count, count_per_motor = settings.finalists
+        n_finalists = min(count + count_per_motor * n, n_starts)
+        n_sorted = max(tables.n_candidates, n_starts)
+        descents = capacity * n_starts
+        loop_arrays = self._loop_arrays = {
+            "iterations": np.zeros(descents, dtype=np.int64),
+            "status": np.zeros(descents, dtype=np.int32),
+            "seconds": np.zeros(descents),
+            "slots": np.zeros(SLOTS, dtype=np.int64),
+            "iterations_before": np.zeros(SLOTS, dtype=np.int64),
+            "mark": np.zeros((SLOTS, state.size)),
         }
-        has_settled = ca.logic_and(is_accepted, decrease <= DESCENT.settled * distance_before)
-        is_stuck = ca.logic_and(ca.logic_not(is_accepted), s["damping"] > DESCENT.damping_ceiling)
-        status = ca.if_else(
-            ca.logic_or(has_settled, is_stuck), float(Status.STALLED), float(RUNNING)
+        self.loop = Job(
+            **{name: memory(array) for name, array in loop_arrays.items()},
+            slot_count=SLOTS,
+            remaining_steps=NO_LIMIT,
+            min_solves=MIN_SOLVES_IN_LANES,
+            slice=SLICE,
         )
-        outputs = [
-            ca.densify(self.state.pack(new_state)),
-            ca.densify(ca.if_else(is_accepted, distance_after, distance_before)),
-            status,
-        ]
-        return ca.Function(name, [state, parameters], outputs)
+        self.states = np.zeros((capacity, n_starts, state.size))
+        self.finalists = np.zeros((capacity, n_finalists), dtype=np.int64)
+        work = self._work = {
+            "states": self.states,
+            "finalists": self.finalists,
+            "slot_memory": np.zeros((SLOTS, state.size + layout.size)),
+            "costs": np.zeros(tables.max_rows, dtype=np.float32),
+            "coefficients": np.zeros(tables.max_features, dtype=np.float32),
+            "sorted_values": np.zeros(n_sorted),
+            "sorted": np.zeros(n_sorted, dtype=np.int64),
+            "rows": np.zeros((n_sorted, 1 + n_groups), dtype=np.int64),
+        }
+        self._tables = tables
+        has_tangents = "tangents" in layout.names
+        self.job = SearchJob(
+            **tables.members,
+            **{name: memory(array) for name, array in work.items()},
+            **{name: layout.slice(name).start for name in ("points", "normals", "weights")},
+            **{name: layout.slice(name).start for name in ("lower", "upper")},
+            tangents=layout.slice("tangents").start if has_tangents else -1,
+            loop=ctypes.addressof(self.loop),
+            n_state=state.size,
+            n_parameters=layout.size,
+            **{f"state_{name}": state.slice(name).start for name in ("q", "damping", "distance")},
+            n_starts=n_starts,
+            n_finalists=n_finalists,
+            race_steps=settings.race_steps,
+            max_iterations=DESCENT.max_iterations,
+            length=LENGTH,
+            damping=DESCENT.damping,
+            tie=settings.tie,
+            same=settings.same,
+        )
+
+    def descents(self, count: int) -> tuple[Rows, Array]:
+        """Return target indices (m,) and states (m, ns) of the finalists of `count` targets."""
+        finalists = self.finalists[:count]
+        owner, _ = np.nonzero(finalists >= 0)
+        return owner, self.states.reshape(-1, self.states.shape[2])[finalists[finalists >= 0]]
+
+    def set_distances(self, count: int, distances: Array) -> None:
+        """Replace the distances of the finalists, in the order of `descents`."""
+        finalists = self.finalists[:count]
+        states = self.states.reshape(-1, self.states.shape[2])
+        states[finalists[finalists >= 0], self.job.state_distance] = distances
 
 
 class NearestSearch:
-    """Search for the nearest configurations of one robot."""
+    """Search for the nearest configurations of one robot; threads may share it."""
 
     def __init__(
         self,
@@ -219,6 +211,7 @@ class NearestSearch:
         self._step = DescentStep(trials.robot.description, kinds)
         self._seeds = SeedTable(trials.robot, settings.seeds)
         self._compiled = compiled
+        self._free_memory: dict[int, list[SearchMemory]] = {}
 
     def with_settings(self, settings: NearestSettings) -> NearestSearch:
         """Return a search with other settings."""
@@ -227,6 +220,11 @@ class NearestSearch:
     @cached_property
     def _kernel(self) -> LoopKernel:
         return LoopKernel(self._step.graph, self._compiled)
+
+    @cached_property
+    def _entry(self) -> Any:
+        """The compiled search; None without compiled code."""
+        return _load_search() if self._kernel.compiled else None
 
     def find(
         self,
@@ -243,24 +241,72 @@ class NearestSearch:
             query: Collision query of the targets; None: collisions are not checked. If none of a
                 target's minima is free of collisions, the nearest one is returned.
         """
-        all_rows, q0 = np.arange(len(targets)), targets.starts(self._trials.robot.description)
-        last_q = np.where(np.isfinite(last_q), last_q, q0)
-        bounds = targets.bounds(self._trials.robot.description)
-        seed_owner, seeds = self._seeds.find(targets, _weights(targets), *bounds)
-        owner = np.concatenate([all_rows, all_rows, seed_owner])
-        start = np.concatenate([q0, last_q, seeds])
+        q0 = np.ascontiguousarray(targets.starts(self._trials.robot.description))
         parameters = self._parameters(targets, UNLIMITED_STEP)
-        states = self._run(self._states(parameters[owner], start), parameters[owner], is_race=True)
-        count, count_per_motor = self._settings.finalists
-        count += count_per_motor * len(self._trials.robot.actuators)
-        finalists = smallest_per_owner(owner, self._distance(states), count)
-        owner = owner[finalists]
-        states = self._run(states[finalists], parameters[owner])
-        q, distance = self._q(states), self._distance(states)
+        if self._entry is None:
+            return self._find_without_compiler(parameters, q0, last_q, query)
+        last_q = np.ascontiguousarray(last_q)
+        lower, upper = targets.bounds(self._trials.robot.description)
+        points, axes = self._seeds.rigid_hand(len(q0), lower, upper)
+        q = np.empty_like(q0)
+        size = 1 if len(q0) == 1 else self._settings.chunk_size
+        free_memory = self._free_memory.setdefault(size, [])
+        try:
+            search = free_memory.pop()
+        except IndexError:
+            search = SearchMemory(self._seeds, self._step, self._settings, size)
+        job, is_shared = search.job, len(points) == 1
+        job.lane_loop = self._loop_address(min(len(q0), size) * job.n_starts)
+        job.scalar_loop = ctypes.cast(self._kernel.entry, ctypes.c_void_p).value
+        for start in range(0, len(q0), size):
+            rows = slice(start, start + size)
+            hand_rows = slice(None) if is_shared else rows
+            job.count, job.stage, job.rigid_step = len(q0[rows]), 0, 0 if is_shared else 1
+            job.rigid_points, job.rigid_axes = memory(points[hand_rows]), memory(axes[hand_rows])
+            job.parameters, job.q0 = memory(parameters[rows]), memory(q0[rows])
+            job.last_q, job.q = memory(last_q[rows]), memory(q[rows])
+            job.last_stage = CHOICE_STAGE if query is None else FINISH_STAGE
+            run_cancellable(self._step.graph.name, self._entry, job)
+            if query is not None:
+                owner, states = search.descents(job.count)
+                distances = self._free_distances(query.rows(start + owner), states)
+                search.set_distances(job.count, distances)
+                job.last_stage = CHOICE_STAGE
+                run_cancellable(self._step.graph.name, self._entry, job)
+        free_memory.append(search)
+        return q
+
+    def _loop_address(self, count: int) -> int | None:
+        """Return the address of the loop in lanes for a number of descents; None without one."""
+        loop = self._kernel.loop_for(count)
+        return None if loop is None else ctypes.cast(loop, ctypes.c_void_p).value
+
+    def _free_distances(self, query: CollisionQuery, states: Array) -> Array:
+        """Return the distances of states, which are much larger for configurations in collision."""
+        distances = self._distance(states)
+        is_free = query.check(self._q(states)).free
+        return np.where(is_free, distances, IN_COLLISION * (1 + distances))
+
+    def _find_without_compiler(
+        self,
+        parameters: Array,
+        q0: Array,
+        last_q: Array,
+        query: CollisionQuery | None,
+    ) -> Array:
+        """Return the nearest minimum to which q0, `last_q` and spread configurations descend."""
+        robot, count = self._trials.robot, 2 + STARTS_WITHOUT_COMPILER
+        samples = spread_points(STARTS_WITHOUT_COMPILER, len(robot.actuators))
+        starts = np.empty((len(q0), count, len(robot.actuators)))
+        starts[:, 0], starts[:, 1] = q0, np.where(np.isfinite(last_q), last_q, q0)
+        starts[:, 2:] = robot.lower + samples * (robot.upper - robot.lower)
+        owner = np.repeat(np.arange(len(q0)), count)
+        q = starts.reshape(len(owner), -1)
+        states = self._run(self._states(parameters[owner], q), parameters[owner])
+        distances = self._distance(states)
         if query is not None:
-            is_free = query.rows(owner).check(q).free
-            distance = np.where(is_free, distance, IN_COLLISION * (1 + distance))
-        return self._nearest(q0, owner, q, distance)
+            distances = self._free_distances(query.rows(owner), states)
+        return self._q(states)[smallest_per_owner(owner, distances, 1)]
 
     def descend(self, targets: TargetBatch, is_local: bool = True) -> Array:
         """Return the local minima (k, n) to which the starts of k targets descend.
@@ -291,10 +337,9 @@ class NearestSearch:
         start = {"q": np.clip(q, lower, upper), "damping": DESCENT.damping}
         return self._step.state.pack_rows(start | {"is_exact": 0.0, "distance": 0.0}, len(q))
 
-    def _run(self, states: Array, parameters: Array, is_race: bool = False) -> Array:
-        """Return the states (m, ns) at the end of descents, or of their first steps."""
-        count = self._settings.race_steps if is_race else DESCENT.max_iterations
-        return self._kernel.run(states, parameters, count).states
+    def _run(self, states: Array, parameters: Array) -> Array:
+        """Return the states (m, ns) at the end of descents."""
+        return self._kernel.run(states, parameters, DESCENT.max_iterations).states
 
     def _q(self, states: Array) -> Array:
         return states[:, self._step.state.slice("q")]
@@ -308,16 +353,6 @@ class NearestSearch:
         tolerances = residual_tolerances(targets)[owner]
         ratios = np.divide(misses, tolerances, where=tolerances > 0, out=np.zeros_like(misses))
         return (ratios**2).sum(axis=(1, 2))
-
-    def _nearest(self, q0: Array, owner: Rows, q: Array, distance: Array) -> Array:
-        """Return the nearest configuration of each target; the travel from q0 decides ties."""
-        robot, minimum = self._trials.robot, np.full(len(q0), np.inf)
-        np.minimum.at(minimum, owner, distance)
-        is_tied = distance <= minimum[owner] * (1 + self._settings.tie)
-        ranges = np.maximum(robot.upper - robot.lower, 1e-9)
-        travel = (np.abs(q - q0[owner]) / ranges).max(axis=1)
-        order = np.lexsort((np.where(is_tied, travel, np.inf), owner))
-        return q[first_per_owner(owner, order, 1)]
 
 
 def _weights(targets: TargetBatch) -> Array:

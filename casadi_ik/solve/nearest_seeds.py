@@ -8,16 +8,26 @@ is the best one of a table in the frame of the palm.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.compile.codegen import c_struct
+from casadi_ik.compile.function_kernel import memory
 from casadi_ik.files.arrays import Array, Rows, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import LENGTH
-from casadi_ik.model.targets import TargetBatch
+
+TILE = 32
+"""Number of rows in a tile of a table, see compile/runtime/nearest_search.c."""
+
+MIN_RANGE = 1e-9
+"""Lower bound of the ranges that scale travel [rad or m]."""
+
+FingerGroupStruct = c_struct("finger_group", driver="nearest_search_job")
 
 
 @dataclass(frozen=True)
@@ -31,7 +41,6 @@ class SeedSettings:
         finger_samples: Number of postures of each group of fingers that share motors.
         seeds: Number of seeds of each target, and additional ones per motor.
         candidates: Number of arm postures per seed for which the fingers are chosen.
-        chunk_size: Number of targets whose costs are in memory at the same time.
     """
 
     regions: int = 128
@@ -40,54 +49,9 @@ class SeedSettings:
     finger_samples: int = 512
     seeds: tuple[int, int] = (32, 2)
     candidates: int = 2
-    chunk_size: int = 32
 
 
 SEED_SETTINGS = SeedSettings()
-
-
-@dataclass(frozen=True, eq=False)
-class ContactGoals:
-    """Points and axes of k targets, with the weights of their squared errors.
-
-    Attributes:
-        points: (k, f, 3) points [m]; 0 where free.
-        axes: (k, f, 3, 3) axes of the contact frames in columns; 0 where free.
-        point_weights: (k, f) weights of squared distances [1/m^2].
-        axis_weights: (k, f, 3) weights of squared differences of the axes.
-    """
-
-    points: Array
-    axes: Array
-    point_weights: Array
-    axis_weights: Array
-
-    @classmethod
-    def of(cls, targets: TargetBatch, weights: Array) -> ContactGoals:
-        """Return the goals of targets.
-
-        Args:
-            targets: k targets.
-            weights: (k, f, 2) weights of position and orientation residuals.
-        """
-        normals = targets.normals
-        tangents = targets.extra_vectors.get("tangents", np.full_like(normals, np.nan))
-        axes = np.stack([normals, tangents, np.cross(normals, tangents)], axis=3)
-        has_tangent = ~np.isnan(tangents[..., 0])
-        # As the rows of a contact frame, see `kinematics.contacts`.
-        shares = np.where(has_tangent[..., None], 0.5, [1.0, 0.0, 0.0])
-        return cls(
-            np.nan_to_num(targets.points),
-            np.nan_to_num(axes),
-            np.where(np.isnan(targets.points[..., 0]), 0.0, (weights[..., 0] / LENGTH) ** 2),
-            np.where(np.isnan(normals[..., :1]), 0.0, weights[..., 1:] ** 2 * shares),
-        )
-
-    def rows(self, rows: Rows | slice) -> ContactGoals:
-        """Return the goals of some targets."""
-        return ContactGoals(
-            self.points[rows], self.axes[rows], self.point_weights[rows], self.axis_weights[rows]
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,33 +72,36 @@ class FingerGroup:
     points: Array
     axes: Array
 
-    @cached_property
+    @property
     def features(self) -> NDArray[np.float32]:
-        """(13 fingers, m) squared point, point and axes of each finger."""
+        """(m / `TILE`, 13 fingers, `TILE`) squared point, point and axis rows of each finger."""
         count = len(self.q)
-        parts = [
-            (self.points**2).sum(axis=2, keepdims=True),
-            self.points,
-            self.axes.reshape(count, len(self.fingers), 9),
-        ]
-        return np.concatenate(parts, axis=2).reshape(count, -1).T.astype(np.float32)
+        axes = np.swapaxes(self.axes, 2, 3).reshape(count, len(self.fingers), 9)
+        squares = (self.points**2).sum(axis=2, keepdims=True)
+        return _in_tiles(np.concatenate([squares, self.points, axes], axis=2))
 
-    def nearest(self, goals: ContactGoals) -> tuple[Rows, Array]:
-        """Return the nearest posture of each of k goals in the palm frame, and its cost (k,).
 
-        The cost omits terms that do not depend on the posture.
-        """
-        fingers, count = list(self.fingers), len(goals.points)
-        point_weights = goals.point_weights[:, fingers, None]
-        axes = goals.axis_weights[:, fingers, None, :] * goals.axes[:, fingers]
-        parts = [
-            point_weights,
-            -2 * point_weights * goals.points[:, fingers],
-            -2 * axes.reshape(count, len(fingers), 9),
-        ]
-        costs = np.concatenate(parts, axis=2).reshape(count, -1).astype(np.float32) @ self.features
-        best = costs.argmin(axis=1)
-        return best, costs[np.arange(count), best].astype(float)
+@dataclass(frozen=True, eq=False)
+class SeedTables:
+    """Tables of postures, as the C code of the search reads them.
+
+    Attributes:
+        members: Members of the job of the search.
+        groups: Groups of fingers.
+        n_seeds: Number of seeds of each target.
+        n_candidates: Number of arm postures for which the fingers are chosen.
+        max_rows: Size of the memory for the costs of rows.
+        max_features: Size of the memory for coefficients.
+        arrays: Arrays that must stay alive with the job.
+    """
+
+    members: dict[str, int]
+    groups: tuple[FingerGroup, ...]
+    n_seeds: int
+    n_candidates: int
+    max_rows: int
+    max_features: int
+    arrays: tuple[Any, ...]
 
 
 class SeedTable:
@@ -142,12 +109,12 @@ class SeedTable:
 
     def __init__(self, robot: ArmHand, settings: SeedSettings = SEED_SETTINGS) -> None:
         """Store the robot; the tables are built at the first use."""
-        self._robot, self._settings = robot, settings
+        self.robot, self._settings = robot, settings
 
     @cached_property
     def _finger_groups(self) -> tuple[FingerGroup, ...]:
         """Groups of fingers that share motors, each with its postures."""
-        robot, count = self._robot, self._settings.finger_samples
+        robot, count = self.robot, self._settings.finger_samples
         # The fingers of a multi-arm robot begin at its trunk.
         hand_motors = set(robot.description.hand_actuators)
         groups: list[tuple[set[int], set[int]]] = []
@@ -162,7 +129,7 @@ class SeedTable:
         result = []
         for group_fingers, group_motors in groups:
             fingers, motors = sorted(group_fingers), sorted(group_motors)
-            samples = spread_points(count if motors else 1, max(len(motors), 1))
+            samples = spread_points(count if motors else TILE, max(len(motors), 1))
             q = np.tile(robot.home, (len(samples), 1))
             lower, upper = robot.lower[motors], robot.upper[motors]
             q[:, motors] = lower + samples[:, : len(motors)] * (upper - lower)
@@ -182,32 +149,30 @@ class SeedTable:
     @cached_property
     def _palm_of_finger(self) -> Rows:
         """(f,) number of the palm of each finger."""
-        palm = np.zeros(len(self._robot.fingers), dtype=np.intp)
-        for number, fingers in enumerate(self._robot.hands.values()):
+        palm = np.zeros(len(self.robot.fingers), dtype=np.intp)
+        for number, fingers in enumerate(self.robot.hands.values()):
             palm[list(fingers)] = number
         return palm
 
     def _palms(self, q: Array) -> Array:
         """Return the palm poses (m, s, 4, 4) at configurations (m, n)."""
-        return np.stack([self._robot.palm(q, side) for side in self._robot.hands], axis=1)
+        return np.stack([self.robot.palm(q, side) for side in self.robot.hands], axis=1)
 
     @cached_property
     def _arm_motors(self) -> list[int]:
         """Indices in q of the motors that move no finger relative to its palm."""
         finger_motors = {i for group in self._finger_groups for i in group.motors}
-        return [i for i in range(len(self._robot.actuators)) if i not in finger_motors]
+        return [i for i in range(len(self.robot.actuators)) if i not in finger_motors]
 
     @cached_property
-    def _arms(self) -> tuple[Array, Array, NDArray[np.float32]]:
-        """Arm postures (m, n), their palms (m, s, 4, 4) and features (16 s, m), by region.
+    def _arms(self) -> tuple[Array, NDArray[np.float32]]:
+        """Arm postures (m, motors), and features (m / `TILE`, 16 s, `TILE`) of their palms.
 
         Postures of a region are ``regions`` rows apart.
         """
-        robot, settings, motors = self._robot, self._settings, self._arm_motors
-        regions = settings.regions * self._palm_factor
-        samples = spread_points(regions * settings.region_samples, max(len(motors), 1))
-        order = _regions(samples[:, : len(motors)], regions)
-        samples = samples[order]
+        robot, settings, motors = self.robot, self._settings, self._arm_motors
+        samples = spread_points(self._regions * settings.region_samples, max(len(motors), 1))
+        samples = samples[_region_order(samples[:, : len(motors)], self._regions)]
         q = np.tile(robot.home, (len(samples), 1))
         lower, upper = robot.lower[motors], robot.upper[motors]
         q[:, motors] = lower + samples[:, : len(motors)] * (upper - lower)
@@ -219,132 +184,121 @@ class SeedTable:
             np.einsum("msji,msj->msi", rotations, origins),
             rotations.reshape(*palms.shape[:2], 9),
         ]
-        features = np.concatenate(parts, axis=2).reshape(len(q), -1)
-        return q, palms, features.T.astype(np.float32)
+        return q[:, motors], _in_tiles(np.concatenate(parts, axis=2))
 
-    def find(
-        self, targets: TargetBatch, weights: Array, lower: Array, upper: Array
-    ) -> tuple[Rows, Array]:
-        """Return target indices (m,) and seeds (m, n) of k targets.
+    @cached_property
+    def tables(self) -> SeedTables:
+        """Tables of arm and finger postures."""
+        robot, settings, palms = self.robot, self._settings, len(self.robot.hands)
+        arm_postures, arm_features = self._arms
+        groups = self._finger_groups if any(group.motors for group in self._finger_groups) else ()
+        seeds, seeds_per_motor = settings.seeds
+        n_seeds = (seeds + seeds_per_motor * len(robot.actuators)) * self._palm_factor
+        n_candidates = min(settings.candidates * n_seeds if groups else n_seeds, self._regions)
+        arrays = {
+            "arm_features": arm_features,
+            "arm_postures": np.ascontiguousarray(arm_postures, dtype=np.float32),
+            "arm_motors": np.array(self._arm_motors, dtype=np.int64),
+            "palm_of_finger": self._palm_of_finger.astype(np.int64),
+            "home": robot.home.copy(),
+            "ranges": np.maximum(robot.upper - robot.lower, MIN_RANGE),
+        }
+        finger_arrays = [
+            (
+                np.array(group.fingers, dtype=np.int64),
+                np.array(group.motors, dtype=np.int64),
+                group.features,
+                np.ascontiguousarray(group.q, dtype=np.float32),
+            )
+            for group in groups
+        ]
+        structs = (FingerGroupStruct * max(len(groups), 1))(
+            *(
+                FingerGroupStruct(
+                    *map(memory, arrays_of_group),
+                    n_fingers=len(group.fingers),
+                    n_motors=len(group.motors),
+                    n_rows=len(group.q),
+                )
+                for group, arrays_of_group in zip(groups, finger_arrays, strict=True)
+            )
+        )
+        members = {name: memory(array) for name, array in arrays.items()} | {
+            "groups": ctypes.addressof(structs),
+            "n_motors": len(robot.actuators),
+            "n_fingers": len(robot.fingers),
+            "n_palms": palms,
+            "n_groups": len(groups),
+            "n_arm_motors": len(self._arm_motors),
+            "regions": self._regions,
+            "n_samples": settings.region_samples,
+            "n_candidates": n_candidates,
+        }
+        return SeedTables(
+            members,
+            groups,
+            min(n_seeds, n_candidates),
+            n_candidates,
+            max(len(arm_postures) + self._regions, *(len(group.q) for group in groups), 0),
+            max(16 * palms, *(13 * len(group.fingers) for group in groups), 0),
+            (arrays, finger_arrays, structs),
+        )
+
+    @cached_property
+    def _mean_hand(self) -> tuple[Array, Array]:
+        """Mean points (1, f, 3) and axes (1, f, 3, 3), in rows, of the tables of the fingers."""
+        fingers = len(self.robot.fingers)
+        points, axes = np.zeros((1, fingers, 3)), np.zeros((1, fingers, 3, 3))
+        for group in self._finger_groups:
+            group_fingers = list(group.fingers)
+            points[0, group_fingers] = group.points.mean(axis=0)
+            axes[0, group_fingers] = np.swapaxes(group.axes.mean(axis=0), 1, 2)
+        return points, axes
+
+    def rigid_hand(self, count: int, lower: Array, upper: Array) -> tuple[Array, Array]:
+        """Return points (k or 1, f, 3) and axes (k or 1, f, 3, 3) of a rigid hand, palm frame.
+
+        They are means of the fingers' tables, or those of fingers that are fixed; a single hand for
+        all targets if no motor is fixed. Axes are in rows.
 
         Args:
-            targets: k targets.
-            weights: (k, f, 2) weights of position and orientation residuals.
+            count: Number k of targets.
             lower: (n,) or (k, n) lower bounds of the motors [rad or m].
             upper: (n,) or (k, n) upper bounds of the motors [rad or m].
         """
-        goals = ContactGoals.of(targets, weights)
-        points, axes = self._rigid_hand(len(targets), lower, upper)
-        size, seeds = self._settings.chunk_size, []
-        for start in range(0, len(targets), size):
-            rows = slice(start, start + size)
-            seeds.append(self._find(goals.rows(rows), points[rows], axes[rows]))
-        owner = np.repeat(np.arange(len(targets)), seeds[0].shape[1])
-        return owner, np.concatenate(seeds).reshape(len(owner), -1)
-
-    def _rigid_hand(self, count: int, lower: Array, upper: Array) -> tuple[Array, Array]:
-        """Return points (k, f, 3) and axes (k, f, 3, 3) of a rigid hand in the palm frame.
-
-        They are means of the fingers' tables, or those of fingers that are fixed.
-        """
-        robot, fingers = self._robot, len(self._robot.fingers)
-        points, axes = np.zeros((count, fingers, 3)), np.zeros((count, fingers, 3, 3))
+        points, axes = self._mean_hand
+        is_fixed = np.equal(lower, upper)
+        if not is_fixed.any():
+            return points, axes
+        robot = self.robot
+        is_fixed = np.broadcast_to(is_fixed, (count, len(robot.actuators)))
+        points, axes = points.repeat(count, axis=0), axes.repeat(count, axis=0)
+        q = np.tile(robot.home, (count, 1))
+        np.copyto(q, lower, where=is_fixed)
+        frames = np.linalg.inv(self._palms(q)[:, self._palm_of_finger]) @ robot.frames_at(q)
         for group in self._finger_groups:
-            group_fingers = list(group.fingers)
-            points[:, group_fingers] = group.points.mean(axis=0)
-            axes[:, group_fingers] = group.axes.mean(axis=0)
-        is_fixed = np.broadcast_to(lower == upper, (count, len(robot.actuators)))
-        if is_fixed.any():
-            q = np.tile(robot.home, (count, 1))
-            np.copyto(q, lower, where=is_fixed)
-            palms = self._palms(q)[:, self._palm_of_finger]
-            frames = np.linalg.inv(palms) @ robot.frames_at(q)
-            for group in self._finger_groups:
-                group_fingers = list(group.fingers)
-                rows = np.flatnonzero(is_fixed[:, list(group.motors)].all(axis=1))
-                fixed = np.ix_(rows, np.array(group_fingers))
-                points[fixed], axes[fixed] = frames[fixed][..., :3, 3], frames[fixed][..., :3, :3]
+            rows = np.flatnonzero(is_fixed[:, list(group.motors)].all(axis=1))
+            fixed = np.ix_(rows, np.array(group.fingers))
+            points[fixed] = frames[fixed][..., :3, 3]
+            axes[fixed] = np.swapaxes(frames[fixed][..., :3, :3], 2, 3)
         return points, axes
-
-    def _find(self, goals: ContactGoals, points: Array, axes: Array) -> Array:
-        """Return the seeds (k, s, n) of some targets."""
-        settings, (arms, palms, features) = self._settings, self._arms
-        costs = (self._coefficients(goals, points, axes).astype(np.float32) @ features).reshape(
-            len(points), settings.region_samples, -1
-        )
-        lowest = costs.min(axis=1)
-        seed_count = settings.seeds[0] + settings.seeds[1] * len(self._robot.actuators)
-        seed_count *= self._palm_factor
-        factor = settings.candidates if self._has_free_fingers else 1
-        regions = _smallest(lowest, factor * seed_count)
-        target = np.arange(len(points))[:, None]
-        sample = costs[target, :, regions].argmin(axis=2)
-        arm = sample * lowest.shape[1] + regions
-        seeds = arms[arm]
-        if not self._has_free_fingers:
-            return seeds
-        total = self._choose_fingers(goals, palms[arm], seeds)
-        return seeds[target, _smallest(total, seed_count)]
 
     @cached_property
     def _palm_factor(self) -> int:
-        return self._settings.regions_per_palm if len(self._robot.hands) > 1 else 1
+        return self._settings.regions_per_palm if len(self.robot.hands) > 1 else 1
 
-    @cached_property
-    def _has_free_fingers(self) -> bool:
-        return any(group.motors for group in self._finger_groups)
-
-    def _coefficients(self, goals: ContactGoals, points: Array, axes: Array) -> Array:
-        """Return the coefficients (k, 16 s) of the costs of rigid hands, without constants."""
-        count, palms = len(points), len(self._robot.hands)
-        coefficients = np.zeros((count, palms, 16))
-        rotation = np.einsum("kf,kfi,kfj->kfij", goals.point_weights, goals.points, points)
-        rotation += np.einsum("kfa,kfia,kfja->kfij", goals.axis_weights, goals.axes, axes)
-        for palm in range(palms):
-            fingers = self._palm_of_finger == palm
-            weights = goals.point_weights[:, fingers]
-            row = coefficients[:, palm]
-            row[:, 0] = weights.sum(axis=1)
-            row[:, 1:4] = -2 * np.einsum("kf,kfi->ki", weights, goals.points[:, fingers])
-            row[:, 4:7] = 2 * np.einsum("kf,kfi->ki", weights, points[:, fingers])
-            row[:, 7:] = -2 * rotation[:, fingers].sum(axis=1).reshape(count, 9)
-        return coefficients.reshape(count, -1)
-
-    def _choose_fingers(self, goals: ContactGoals, palms: Array, seeds: Array) -> Array:
-        """Set the fingers of seeds (k, m, n) at palms (k, m, s, 4, 4); return costs (k, m)."""
-        k, m = seeds.shape[:2]
-        palms = palms.reshape(k * m, *palms.shape[2:])[:, self._palm_of_finger]
-        rotations, origins = palms[..., :3, :3], palms[..., :3, 3]
-        goals = goals.rows(np.repeat(np.arange(k), m))
-        offsets = goals.points - origins
-        in_palm = ContactGoals(
-            np.einsum("kfji,kfj->kfi", rotations, offsets),
-            np.swapaxes(rotations, 2, 3) @ goals.axes,
-            goals.point_weights,
-            goals.axis_weights,
-        )
-        costs = (goals.point_weights * (offsets**2).sum(axis=2)).sum(axis=1)
-        flat = seeds.reshape(k * m, -1)
-        for group in self._finger_groups:
-            best, cost = group.nearest(in_palm)
-            flat[:, group.motors] = group.q[best]
-            costs += cost
-        seeds[...] = flat.reshape(seeds.shape)
-        return costs.reshape(k, m)
+    @property
+    def _regions(self) -> int:
+        return self._settings.regions * self._palm_factor
 
 
-def _smallest(values: Array, count: int) -> Rows:
-    """Return the columns of the smallest values of each row of (k, m), in order: (k, count)."""
-    count = min(count, values.shape[1])
-    if count < values.shape[1]:
-        columns = np.argpartition(values, count, axis=1)[:, :count]
-    else:
-        columns = np.tile(np.arange(count), (len(values), 1))
-    order = np.argsort(np.take_along_axis(values, columns, axis=1), axis=1, kind="stable")
-    return np.take_along_axis(columns, order, axis=1)
+def _in_tiles(features: Array) -> NDArray[np.float32]:
+    """Return the features (m, ...) of rows in tiles: (m / `TILE`, features, `TILE`)."""
+    flat = features.reshape(len(features) // TILE, TILE, -1)
+    return np.ascontiguousarray(np.swapaxes(flat, 1, 2), dtype=np.float32)
 
 
-def _regions(samples: Array, regions: int) -> Rows:
+def _region_order(samples: Array, regions: int) -> Rows:
     """Return an order of samples (m, d) in which those of a region are ``regions`` rows apart.
 
     Regions of equal size result from repeated halves of the samples along one joint after the

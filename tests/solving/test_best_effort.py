@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import casadi_ik as ik
+from casadi_ik.compile.cancellation import virtual_machine
 
 
 def out_of_reach(robot, count, seed=0, factor=1.5):
@@ -32,7 +33,7 @@ def test_no_other_optimiser_comes_nearer(name):
     assert (batch.status == ik.Status.NEAREST)[~batch.success].all()
     assert (~batch.success).sum() >= 3
     assert batch.limits_ok.all()
-    start_distances = distances(solver, points, normals, batch.q)
+    nearest_distances = distances(solver, points, normals, batch.q)
     tolerances = np.array([(item.position, item.angle) for item in solver.tolerances.values()])
     for row in np.flatnonzero(~batch.success):
 
@@ -44,7 +45,66 @@ def test_no_other_optimiser_comes_nearer(name):
 
         for start in robot.random(rng, 6):
             best = least_squares(residual, start, bounds=(robot.lower, robot.upper))
-            assert start_distances[row] <= 2 * best.cost * (1 + 1e-6)
+            assert nearest_distances[row] <= 2 * best.cost * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("name", ["viperx_300s", "ur5e", "kuka_lwr_barrett"])
+def test_single_targets_equal_those_of_a_batch(name):
+    robot = ik.load_robot(name)
+    solver = ik.Solver(robot)
+    points, normals = out_of_reach(robot, 70, factor=2.0)
+    batch = solver.solve_batch(points, normals, best_effort=True)
+    rows = np.flatnonzero(batch.status == ik.Status.NEAREST)[:5]
+    assert len(rows) == 5
+    for row in rows:
+        contacts = zip(robot.fingers, points[row], normals[row], strict=True)
+        grasp = ik.Grasp({finger: ik.Contact(*vectors) for finger, *vectors in contacts})
+        single = solver.solve(grasp, diagnose=False, best_effort=True)
+        np.testing.assert_array_equal(single.q, batch.q[row])
+
+
+def test_poses_of_five_axes_are_nearest():
+    """The reference is the best of many bounded least-squares solutions."""
+    robot, rng = ik.load_robot("viperx_300s"), np.random.default_rng(2)
+    fixed_motor = 3
+    fixed = {robot.actuators[fixed_motor]: float(robot.home[fixed_motor])}
+    solver = ik.Solver(robot)
+    finger = robot.fingers[0]
+    for frame in robot.contact_frames(robot.random(rng, 3))[:, 0]:
+        frame[:3, 3] *= 1.1
+        grasp = ik.Grasp({finger: ik.Contact.at(frame)})
+        solution = solver.solve(grasp, fixed=fixed, diagnose=False, best_effort=True)
+        assert solution.status is ik.Status.NEAREST
+        residual = pose_residual(robot, frame, solver.tolerances[finger])
+        lower, upper = robot.lower.copy(), robot.upper.copy()
+        lower[fixed_motor] = robot.home[fixed_motor] - 1e-9
+        upper[fixed_motor] = robot.home[fixed_motor] + 1e-9
+        starts = np.clip(robot.random(rng, 40), lower, upper)
+        costs = [least_squares(residual, start, bounds=(lower, upper)).cost for start in starts]
+        assert np.sum(residual(solution.q) ** 2) <= 2 * min(costs) * (1 + 1e-6)
+
+
+def test_equally_near_configurations_are_decided_by_travel():
+    """The rotation of the first joint does not matter for a point above the axis of the base."""
+    robot = ik.load_robot("ur5e")
+    solver = ik.Solver(robot)
+    grasp = ik.Grasp({robot.fingers[0]: ik.Contact([0.0, 0.0, 3.0])})
+    for start in robot.random(np.random.default_rng(1), 3):
+        solution = solver.solve(grasp, q0=start, diagnose=False, best_effort=True)
+        restarted = solver.solve(grasp, q0=solution.q, diagnose=False, best_effort=True)
+        np.testing.assert_allclose(restarted.q, solution.q, atol=1e-4)
+
+
+def test_nearest_configurations_do_not_need_a_compiler():
+    robot = ik.load_robot("ur5e")
+    points, normals = out_of_reach(robot, 4, factor=2.5)
+    compiled = ik.Solver(robot).solve_batch(points, normals, best_effort=True)
+    with virtual_machine():
+        virtual = ik.Solver(robot).solve_batch(points, normals, best_effort=True)
+    assert (compiled.status == ik.Status.NEAREST).any()
+    np.testing.assert_array_equal(virtual.status, compiled.status)
+    unsolved = ~compiled.success
+    np.testing.assert_allclose(virtual.error_ratio[unsolved], compiled.error_ratio[unsolved])
 
 
 def test_error_ratio_measures_the_excess(robot):
