@@ -15,7 +15,7 @@ from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
 from casadi_ik.solve.alternatives import side_links
-from casadi_ik.solve.collision_free_parameters import COLLISION_FREE_PARAMETERS
+from casadi_ik.solve.collision_free_steps import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
 from casadi_ik.solve.subproblems import TRUNK_STRETCH
 

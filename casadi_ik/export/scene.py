@@ -24,7 +24,7 @@ from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ARM_SEARCH, arms_graph
 from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.solve.arm_search import RedundancySamples
-from casadi_ik.solve.collision_free_parameters import COLLISION_FREE_PARAMETERS
+from casadi_ik.solve.collision_free_steps import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.free_hands import UNCONSTRAINED_FINGER_PARAMETERS
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.subproblems import PALM_SCALES

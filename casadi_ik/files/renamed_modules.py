@@ -30,6 +30,7 @@ NEW_PATHS = {
     "papers.screw_tasks": "papers.chandra.screw_tasks",
     "registry": "solve.registry",
     "robots": "model",
+    "solve.limits": "solve.looped_method",
     "viewing": "app.viewer",
     "views": "app.pictures",
 }

@@ -32,7 +32,7 @@ from casadi_ik.kinematics.contacts import LENGTH, ContactRows, Kinds, point_norm
 from casadi_ik.kinematics.couplings import joint_positions
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.limits import clip_starts
+from casadi_ik.solve.looped_method import clip_starts
 from casadi_ik.solve.method import Method, Outcome
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import (

@@ -14,8 +14,8 @@ from casadi_ik.kinematics.contact_batches import group_by_kinds
 from casadi_ik.model.targets import CLEARANCE, MANIPULABILITY, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
 from casadi_ik.solve.batches import judge_outcome
-from casadi_ik.solve.collision_free_parameters import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.collision_free_search import CollisionFreeResult, CollisionFreeSearch
+from casadi_ik.solve.collision_free_steps import COLLISION_FREE_PARAMETERS
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.solution import BatchSolution
 from casadi_ik.solve.status import Status

@@ -33,9 +33,8 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.model.targets import CLEARANCE, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder, side_links
 from casadi_ik.solve.arm_search import Preference
-from casadi_ik.solve.collision_free_parameters import COLLISION_FREE_PARAMETERS
+from casadi_ik.solve.collision_free_steps import COLLISION_FREE_PARAMETERS, RandomSteps
 from casadi_ik.solve.free_hands import SideHands, UnconstrainedFingers
-from casadi_ik.solve.random_steps import RandomSteps
 from casadi_ik.solve.row_selection import Deduplicator, improving_rows, largest_per_owner
 from casadi_ik.solve.solution import CollisionReport
 from casadi_ik.solve.subproblems import sample_trunks

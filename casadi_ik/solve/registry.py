@@ -14,7 +14,7 @@ from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.method import Method
 from casadi_ik.solve.thumb_first.method import ThumbFirstMethod
-from casadi_ik.solve.thumb_first.parameters import ThumbFirstParameters
+from casadi_ik.solve.thumb_first.state import ThumbFirstParameters
 
 Build = Callable[[RobotDescription, Any, bool], Method]
 """Function that builds a method from a robot, a parameter record and a flag to compile."""

@@ -24,7 +24,7 @@ from casadi_ik.logs import McapRecorder
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.papers.chandra.screw_tasks import ScrewControlStep, ScrewTask
-from casadi_ik.solve.limits import coupling_jacobian
+from casadi_ik.solve.looped_method import coupling_jacobian
 from casadi_ik.solve.recorder import SolveBlock
 from casadi_ik.solve.solution import BatchSolution
 from casadi_ik.solve.status import Status

@@ -25,7 +25,12 @@ from casadi_ik.kinematics.screws import TipChain, TipMotion, finger_chain, relat
 from casadi_ik.kinematics.se3 import normal_error, perpendicular
 from casadi_ik.kinematics.smooth import Expr, safe_norm, with_cse
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.solve.limits import clamp_to_limits, coupling_fields, coupling_values, limit_mask
+from casadi_ik.solve.looped_method import (
+    clamp_to_limits,
+    coupling_fields,
+    coupling_values,
+    limit_mask,
+)
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.trace import LIMIT_MASK, STATUS, STEP_SIZE, Q
 

@@ -40,8 +40,13 @@ from casadi_ik.papers.qiu.tasks import (
     weighted,
     weighted_damped,
 )
-from casadi_ik.solve.limits import clamp_to_limits, clip_starts, limit_mask
-from casadi_ik.solve.looped_method import LoopedMethod, Start
+from casadi_ik.solve.looped_method import (
+    LoopedMethod,
+    Start,
+    clamp_to_limits,
+    clip_starts,
+    limit_mask,
+)
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.trace import STEP_SIZE, RecordedJacobian
 

@@ -21,21 +21,22 @@ from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import PREFERENCES, TargetBatch
 from casadi_ik.solve.hand_first.driver import Searches, SearchPool
-from casadi_ik.solve.hand_first.independent_sides import (
+from casadi_ik.solve.hand_first.iteration import iteration_graph
+from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
+from casadi_ik.solve.hand_first.parameters import HandFirstParameters
+from casadi_ik.solve.hand_first.robot_parts import (
+    PALM_KINDS,
     SideSolver,
+    palm_contacts,
+    palm_robot,
     robot_trace,
     solve_sides_independently,
 )
-from casadi_ik.solve.hand_first.iteration import iteration_graph
-from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
-from casadi_ik.solve.hand_first.palm_target import PALM_KINDS, palm_contacts, palm_robot
-from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.search_code import SearchPlan, can_search
 from casadi_ik.solve.hand_first.seeds import Seeds
 from casadi_ik.solve.hand_first.state import KEPT_ACROSS_RESTARTS, beginning
 from casadi_ik.solve.hand_first.step import HandFirstStep
-from casadi_ik.solve.limits import coupling_jacobian
-from casadi_ik.solve.looped_method import LoopedMethod, Start
+from casadi_ik.solve.looped_method import LoopedMethod, Start, coupling_jacobian
 from casadi_ik.solve.method import HandSearch, Outcome, SingleOutcome
 from casadi_ik.solve.proofs.premises import ArmSpan, arm_span, palms_in_span
 from casadi_ik.solve.status import Phase, Status

@@ -23,7 +23,7 @@ from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix, poin
 from casadi_ik.kinematics.palm import POSE_DIMENSION
 from casadi_ik.kinematics.smooth import Expr, call_function, with_cse
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.solve.limits import coupling_fields, coupling_values, pack_bits
+from casadi_ik.solve.looped_method import coupling_fields, coupling_values, pack_bits
 from casadi_ik.solve.status import Phase
 from casadi_ik.solve.trace import (
     ACCEPTED,

@@ -17,8 +17,7 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import Q0, TargetBatch
 from casadi_ik.solve.looped_method import LoopedMethod, Start
 from casadi_ik.solve.status import Phase
-from casadi_ik.solve.thumb_first.layouts import THUMB_FIRST_STAGES
-from casadi_ik.solve.thumb_first.parameters import ThumbFirstParameters
+from casadi_ik.solve.thumb_first.state import THUMB_FIRST_STAGES, ThumbFirstParameters
 from casadi_ik.solve.thumb_first.step import ThumbFirstStep
 
 

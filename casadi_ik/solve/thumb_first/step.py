@@ -44,7 +44,7 @@ from casadi_ik.kinematics.palm import (
     pose_step,
 )
 from casadi_ik.kinematics.smooth import Expr, with_cse
-from casadi_ik.solve.limits import pack_bits
+from casadi_ik.solve.looped_method import pack_bits
 from casadi_ik.solve.status import Phase, Status
 from casadi_ik.solve.thumb_first.closed_chain_step import (
     STEP_SOLVERS,
@@ -54,7 +54,7 @@ from casadi_ik.solve.thumb_first.closed_chain_step import (
     evaluate_contacts,
     linearise_contacts,
 )
-from casadi_ik.solve.thumb_first.layouts import THUMB_FIRST_STAGES, ThumbFirstLayouts
+from casadi_ik.solve.thumb_first.state import THUMB_FIRST_STAGES, ThumbFirstLayouts
 
 
 @dataclass(frozen=True, eq=False)
