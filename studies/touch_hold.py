@@ -39,8 +39,7 @@ from runner.study import robot_of, standing
 
 import casadi_ik as ik
 from casadi_ik.collision.solids import object_solids
-from casadi_ik.planning.touch.found_grasps import FoundGrasp
-from casadi_ik.planning.touch.robustness import random_displacements
+from casadi_ik.planning.touch.found_grasps import FoundGrasp, random_displacements
 
 mujoco: Any = import_module("mujoco")
 

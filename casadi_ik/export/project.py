@@ -43,7 +43,7 @@ from casadi_ik.export.targets import (
 )
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Contact, Grasp
-from casadi_ik.planning.touch.library import touch_library
+from casadi_ik.planning.touch.hands import touch_library
 
 EXPORT_MARKER = ".casadi_ik_export"
 """Name of the file that identifies a folder as an export."""

@@ -1,4 +1,4 @@
-"""Old import paths of documented modules, which work until version 0.3 with a warning."""
+"""Old import paths of documented modules, and warnings of deprecated names, until version 0.3."""
 
 from __future__ import annotations
 
@@ -90,3 +90,14 @@ class _RenamedModuleLoader(Loader):
 def install() -> None:
     """Make the old import paths work; called once by the package."""
     sys.meta_path.insert(0, RenamedModuleFinder())  # type: ignore[arg-type]
+
+
+def warn_renamed(old: str, new: str, stacklevel: int) -> None:
+    """Warn that a name is deprecated.
+
+    Args:
+        old: Deprecated name.
+        new: Name to use instead.
+        stacklevel: Stack level of the caller's caller, as for `warnings.warn`.
+    """
+    warnings.warn(f"{old} is deprecated; use {new}", DeprecationWarning, stacklevel=stacklevel)

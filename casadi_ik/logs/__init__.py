@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.logs.cdr import RecordedMotion, read_motion
 from casadi_ik.logs.events import EventKind, EventRules, detect_events
 from casadi_ik.logs.explanation import Explanation, compare_solves, explain, match_targets
 from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log, LogInfo
 from casadi_ik.logs.reader import open_log as open  # noqa: A004 - used as `ik.logs.open`
-from casadi_ik.logs.renamed import warn_renamed
 from casadi_ik.logs.repair import finish_log, merge_logs
 from casadi_ik.logs.solve import LoggedTarget, SolveRecord, one_solve
 from casadi_ik.logs.tables import MethodRows, Table

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import Event
 from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log
-from casadi_ik.logs.renamed import warn_renamed
 from casadi_ik.logs.solve import PhaseSpan, SolveRecord, optional_targets
 from casadi_ik.logs.wording import (
     counted_noun,

@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import InputError, LogError
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.files.writing import to_json
 from casadi_ik.logs.chunks import check_size
 from casadi_ik.logs.container import ForeignLogError
-from casadi_ik.logs.renamed import warn_renamed
 
 MESSAGE_KINDS = ("iteration", "solve", "event")
 """Kinds of messages; every method has one topic of each kind."""

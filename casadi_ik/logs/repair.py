@@ -25,6 +25,7 @@ from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import LogError, os_errors
 from casadi_ik.files.arrays import Counts
 from casadi_ik.files.writing import atomic_write
+from casadi_ik.logs.chunk_writer import lock_file
 from casadi_ik.logs.chunks import (
     COMPRESSORS,
     MessageRun,
@@ -53,7 +54,6 @@ from casadi_ik.logs.format import (
     parse_layout,
     with_checksum,
 )
-from casadi_ik.logs.log_file import lock_file
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.shards import Paths, Shard, open_shards
 

@@ -24,7 +24,7 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError, LogError
-from casadi_ik.logs.chunk_writer import ChunkWriter, TopicMessages
+from casadi_ik.logs.chunk_writer import ChunkWriter, LogFile, TopicMessages
 from casadi_ik.logs.chunks import COMPRESSORS
 from casadi_ik.logs.container import file_head
 from casadi_ik.logs.events import SINGULAR, EventKind, EventRules, detect_events, event_format
@@ -37,7 +37,6 @@ from casadi_ik.logs.format import (
     schema_text,
     topic,
 )
-from casadi_ik.logs.log_file import LogFile
 from casadi_ik.logs.rows import measured_format, measured_rows, solve_format, solve_rows
 from casadi_ik.solve.recorder import Recorder, SolveBlock
 from casadi_ik.solve.trace import CLEARANCE, TraceFormat

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools, read_only
+from casadi_ik.files.input_checks.numbers import warn_of_wide_tolerance
 from casadi_ik.files.input_checks.poses import MAX_SKEW, single_pose
-from casadi_ik.files.input_checks.units import warn_of_wide_tolerance
 from casadi_ik.model.pose import Free, inverse
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import KEYPOINTS, lost_contacts_reason
-from casadi_ik.files.input_checks.times import (
+from casadi_ik.files.input_checks.numbers import (
     MAX_FRAME_INTERVAL,
     MAX_WAYPOINT_INTERVAL,
     check_time_unit,

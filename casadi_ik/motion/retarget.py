@@ -20,8 +20,13 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoint_orders import STANDARD_ORDER, OrderConverter
-from casadi_ik.files.input_checks.keypoints import KEYPOINTS, KNUCKLES, FrameFilter
+from casadi_ik.files.input_checks.keypoints import (
+    KEYPOINTS,
+    KNUCKLES,
+    STANDARD_ORDER,
+    FrameFilter,
+    OrderConverter,
+)
 from casadi_ik.files.reading import Angles, Frame, Point, Struct, frame_matrix, read
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import real_array

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.numbers import warn_of_far_contacts, warn_of_wide_tolerance
 from casadi_ik.files.input_checks.poses import checked_pose
-from casadi_ik.files.input_checks.units import warn_of_far_contacts, warn_of_wide_tolerance
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contact_batches import check_extra_vectors
 from casadi_ik.kinematics.contacts import LENGTH

@@ -136,7 +136,7 @@ def test_an_interrupt_while_a_chunk_is_written(
             raise KeyboardInterrupt
         return done
 
-    monkeypatch.setattr("casadi_ik.logs.log_file.os.write", interrupted)
+    monkeypatch.setattr("casadi_ik.logs.chunk_writer.os.write", interrupted)
     path = tmp_path / "cup.mcap"
     with pytest.raises(KeyboardInterrupt):
         record_many(path, 4)

@@ -9,7 +9,7 @@ from touch_cases import PLACE, solver_of, surface_of
 
 import casadi_ik as ik
 from casadi_ik import errors
-from casadi_ik.app.cli.grasp import grasps_npz
+from casadi_ik.app.cli.planning import grasps_npz
 
 
 def test_every_grasp_is_confirmed_in_the_scene(grasps_found):

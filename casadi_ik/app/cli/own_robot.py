@@ -32,7 +32,7 @@ from casadi_ik.export.project import (
 )
 from casadi_ik.integrations.importing import robot_import
 from casadi_ik.integrations.importing.capsules import largest_excess
-from casadi_ik.integrations.importing.end_links import palm_warning
+from casadi_ik.integrations.importing.limbs import palm_warning
 from casadi_ik.integrations.importing.reference_kinematics import largest_difference
 from casadi_ik.integrations.importing.robot_import import ImportResult
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot

@@ -12,23 +12,32 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.errors import DescriptionError, InputError, MissingExtraError
-from casadi_ik.integrations.importing.end_links import LinkChoice, choose_palms, choose_tip
 from casadi_ik.integrations.importing.fingers import FingerChain, find_fingers
-from casadi_ik.integrations.importing.home_posture import guess_home
 from casadi_ik.integrations.importing.joint_defaults import (
     SPINNER_REASON,
     UNUSED_JOINT_REASON,
     assumed_limits,
+    guess_home,
     joints_to_link,
     joints_to_palm,
     locked_multi_axis_joints,
     locked_spinners,
     locked_unused_joints,
 )
-from casadi_ik.integrations.importing.limbs import MIN_LONE_ARM_JOINTS
+from casadi_ik.integrations.importing.limbs import (
+    MIN_LONE_ARM_JOINTS,
+    LinkChoice,
+    choose_palms,
+    choose_tip,
+)
 from casadi_ik.integrations.importing.meshes import link_meshes
-from casadi_ik.integrations.importing.pads import guess_fixed_jaw, guess_pads, tool_pad
-from casadi_ik.integrations.importing.palm_frame import guess_palm_frame, guess_thumb
+from casadi_ik.integrations.importing.pads import (
+    guess_fixed_jaw,
+    guess_pads,
+    guess_palm_frame,
+    guess_thumb,
+    tool_pad,
+)
 from casadi_ik.integrations.importing.robot_shapes import robot_shapes
 from casadi_ik.integrations.importing.write import FileEntry, HandEntry, ImportedDescription
 from casadi_ik.model.imported_parts import hand_from_file

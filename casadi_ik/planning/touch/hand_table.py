@@ -24,8 +24,7 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.forward import actuated
 from casadi_ik.kinematics.se3 import skew
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.planning.touch.hands import HandCandidates
-from casadi_ik.planning.touch.library import touch_library
+from casadi_ik.planning.touch.hands import HandCandidates, touch_library
 from casadi_ik.planning.touch.surface import NEIGHBOURS
 
 BINS = 20

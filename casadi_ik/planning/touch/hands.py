@@ -1,12 +1,17 @@
-"""Candidates of grasps: palm poses and hand postures with the contacts of their fingertips."""
+"""Records of the grasp search (parameters, hands, contacts), and its compiled drivers."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.compile.codegen import WIDE, define, driver_text
+from casadi_ik.compile.function_kernel import machine_lanes
+from casadi_ik.compile.libraries import load_library
+from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.lazy_import import RecordReprMixin
 
@@ -190,3 +195,24 @@ class HandCandidates(RecordReprMixin):
 def _distances(points: Array, reference: Array) -> Array:
     """Return the distances (k, n) between points (k, 3) and reference points (n, 3)."""
     return np.sqrt(((points[:, None] - reference) ** 2).sum(axis=2))
+
+
+def touch_library() -> Any:
+    """Return the compiled drivers `touch`, `apart`, `loads` and `nearest`.
+
+    Raises:
+        UnsupportedError: There is no C compiler.
+    """
+    sources = (
+        WIDE if machine_lanes() else "",
+        "typedef double scalar;\ntypedef double real;\n",
+        define({"STEP_IN": 0, "STEP_OUT": 0}),
+        *(driver_text(name) for name in ("common", "touch_job", "touch", "loads", "nearest")),
+    )
+    text = "".join(sources)
+    library = load_library("touch", lambda: text, "casadi_ik_touch", text)
+    if library is None:
+        raise UnsupportedError(
+            "grasps_of: a C compiler is missing; expected one on the path (docs/install.md)"
+        )
+    return library

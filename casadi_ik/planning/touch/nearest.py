@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.compile.codegen import c_struct
 from casadi_ik.files.arrays import Array
-from casadi_ik.planning.touch.library import touch_library
+from casadi_ik.planning.touch.hands import touch_library
 
 COINCIDENT = 2.5e-4
 """Triangles within this distance of a nearest point count as adjacent to it [m].

@@ -13,7 +13,7 @@ from casadi_ik.compile.cancellation import SLICE, run_cancellable
 from casadi_ik.compile.codegen import c_struct
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.model.joints import Actuator
-from casadi_ik.planning.touch.library import touch_library
+from casadi_ik.planning.touch.hands import touch_library
 
 EDGES = 8
 """Number of edges of the pyramid inscribed in a friction cone."""

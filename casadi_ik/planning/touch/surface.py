@@ -19,8 +19,8 @@ from casadi_ik.errors import InputError, optional_import, os_errors
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
 from casadi_ik.files.lazy_import import RecordReprMixin
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.files.writing import atomic_write
-from casadi_ik.logs.renamed import warn_renamed
 from casadi_ik.model.mesh_shape import MeshShape
 from casadi_ik.model.objects import GraspObject, load_object
 from casadi_ik.planning.touch.nearest import NearestPoints, TriangleTree
