@@ -42,8 +42,8 @@ OBSTACLES = 4
 RELIST_MOTION = 0.1
 """Largest motion of shapes after which a guard compares all pairs again [m]."""
 
-NearbyPairs = c_struct("nearby_pairs", driver="guard_job")
-GuardJob = c_struct("guard_job")
+NearbyPairs = c_struct("nearby_pairs", driver="guard")
+GuardJob = c_struct("guard_job", driver="guard")
 
 
 class Guarding:
@@ -189,7 +189,7 @@ class ClearanceKernel:
         shapes = self._robot.shapes
         constants = {"N_Q": self._n, "N_CAPSULES": len(shapes.capsules)}
         constants |= {"N_OWN": len(shapes.solids), "OBSTACLES": OBSTACLES, **C_NAMES}
-        names = "clearance_job", "clearance", "guard_job", "guard"
+        names = "clearance_job", "clearance", "guard"
         library = load_function(
             f"{self.name}_lanes{lanes}",
             lambda: self._graph.function,

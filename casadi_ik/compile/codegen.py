@@ -112,16 +112,14 @@ def type_definitions(options: CodeOptions) -> str:
     if options.single:
         single = driver_text("elementary_single") + driver_text("real")
         return f"{loops}#define SINGLE\n{single}"
-    scalar_text = loops + driver_text("elementary_alone") + forms
+    scalar_text = loops + forms
     if options.lanes > 1:
-        lane_text = driver_text("lanes") + driver_text("elementary_lanes") + forms
-        return scalar_text + define({"LANES": options.lanes}) + lane_text
-    vector_text = driver_text("elementary_few") + forms
+        return scalar_text + define({"LANES": options.lanes}) + driver_text("lanes") + forms
     return "".join(
         (
             scalar_text,
-            f"#define FEW 2\n{vector_text}#undef FEW\n",
-            f"#ifdef __AVX2__\n#define FEW 4\n{vector_text}#undef FEW\n#endif\n",
+            f"#define FEW 2\n{forms}#undef FEW\n",
+            f"#ifdef __AVX2__\n#define FEW 4\n{forms}#undef FEW\n#endif\n",
             driver_text("elementary_calls") + driver_text("real"),
         )
     )

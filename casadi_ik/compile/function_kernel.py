@@ -112,7 +112,7 @@ def machine_lanes() -> int:
 
 MAP_SYMBOL, MAP_LANES_SYMBOL = "casadi_ik_map", "casadi_ik_map_lanes"
 
-MapJob = c_struct("map_job")
+MapJob = c_struct("map_job", driver="jobs")
 
 
 def _map_job(
@@ -224,15 +224,15 @@ class FunctionKernel:
         """Return the compiled map; None without a compiler."""
         lanes = machine_lanes() if in_lanes else 0
         text = define({"N_IN": len(self._input_sizes), "N_OUT": len(self._output_sizes)})
+        map_text = driver_text("jobs") + driver_text("map")
         if not lanes:
-            text += driver_text("map_job") + driver_text("map") + driver
+            text += map_text + driver
             return self._map(self.name, text, MAP_SYMBOL)
         text += define({"TOTAL": sum(self._input_sizes) + sum(self._output_sizes)})
         for name, sizes in (("SIZES_IN", self._input_sizes), ("SIZES_OUT", self._output_sizes)):
             text += f"#define {name} {{{', '.join(map(str, sizes))}}}\n"
-        text += driver_text("map_job") + driver_text("map_lanes")
         try:
-            return self._map(f"{self.name}_lanes{lanes}", text, MAP_LANES_SYMBOL, lanes)
+            return self._map(f"{self.name}_lanes{lanes}", text + map_text, MAP_LANES_SYMBOL, lanes)
         except KernelError as error:
             logger.warning("%s: one sample at a time: %s", self.name, error)
             return self._load(in_lanes=False)

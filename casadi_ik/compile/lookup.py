@@ -31,7 +31,7 @@ CHUNK = 256
 """Number of samples that NumPy compares at once, so that they fit into the cache."""
 
 
-_Job = c_struct("lookup_job")
+_Job = c_struct("lookup_job", driver="jobs")
 
 
 class LookupKernel:
@@ -79,7 +79,7 @@ class LookupKernel:
 
     def _driver(self) -> str:
         constants = define(self.constants | {"REGISTER_BYTES": 8 * machine_lanes()})
-        return constants + driver_text("lookup_job") + driver_text("lookup")
+        return constants + driver_text("lookup")
 
     def __call__(self, count: int, *inputs: Any) -> NDArray[np.int64]:
         """Find the nearest rows.

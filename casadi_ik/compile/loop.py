@@ -178,7 +178,7 @@ MAX_FIRST_TRACE_BYTES = 2**24
 """Maximum initial capacity of a trace [bytes]."""
 
 
-Job = c_struct("loop_job")
+Job = c_struct("loop_job", driver="jobs")
 
 
 @dataclass(frozen=True)
@@ -384,7 +384,7 @@ class LoopKernel:
 
     def _driver(self) -> str:
         """Return the C text of the loop with its constants."""
-        texts = driver_text("loop_job"), driver_text("loop")
+        texts = driver_text("jobs"), driver_text("loop")
         return define(self.constants) + row_driver(self.step.record) + "".join(texts)
 
     @cached_property
@@ -448,7 +448,7 @@ class LoopKernel:
     def run_from_slots(
         self, starts: SlotSource, count: int, max_iterations: int, trace: bool
     ) -> LoopResult:
-        """Solve a batch whose starts a callback writes; see `follow` in runtime/loop_job.c.
+        """Solve a batch whose starts a callback writes; see `follow` in runtime/jobs.c.
 
         Args:
             starts: Memory of the starts and the callback; compiled code only.

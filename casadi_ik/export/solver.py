@@ -370,9 +370,6 @@ class SolverSources:
             constants += define({"N_IN": function.n_in(), "N_OUT": function.n_out()})
         if driver == "lookup":
             extra += function.numel_out(0)
-        prerequisite = {"clearance": "lanes_alone"}.get(driver)
-        text = driver_text(prerequisite) if prerequisite else ""
-        text += driver_text(driver)
         body = "".join(
             (
                 f'#include "{self.prefix}_parts.h"\n\n',
@@ -381,7 +378,7 @@ class SolverSources:
                 f"#define MEMORY {self.prefix}_memory\n",
                 driver_text("freestanding"),
                 constants,
-                text,
+                driver_text(driver),
             )
         )
         return KernelSource(name, f"{driver}_job", body, extra)
@@ -397,7 +394,7 @@ class SolverSources:
     def substitutes(self) -> dict[str, str]:
         """Substitutes of the template marks."""
         robot, sizes = self.robot, self.plan.sizes
-        jobs = "".join(driver_text(f"{name}_job") for name in ("loop", "map", "lookup"))
+        jobs = driver_text("jobs")
         jobs += self.scene.jobs() if self.scene else ""
         declarations = "".join(
             f"int {self.prefix}_{p.name}_kernel({p.job} *job, {self.prefix}_memory *memory);\n"

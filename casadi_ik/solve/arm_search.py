@@ -177,7 +177,7 @@ class ArmSearch:
         return self._family.is_exact
 
     def _load(self) -> Any:
-        parts = map(driver_text, ("map_job", "clearance_job", "arm_search"))
+        parts = map(driver_text, ("jobs", "clearance_job", "arm_search"))
         driver = "".join(("#include <stdint.h>\n", *parts))
         library = load_library("arm_search", lambda: driver, ARM_SEARCH_SYMBOL, driver)
         return None if library is None else library[ARM_SEARCH_SYMBOL]

@@ -6,11 +6,81 @@
  * are within 2 units in the last place of normal numbers; angles above 5e8 rad are passed to the C
  * library. Reductions and coefficients are those of the Cephes library of Moshier (sin.c, atan.c).
  *
- * Requires the macros NAME(f), QUALIFIERS, INNER (qualifiers of inlined functions), REAL and INTEGER,
- * BITS(real) and REAL_OF(integer), which reinterpret bits, MASK(comparison) with all bits of a true
- * entry set, ROOT, SMALL(real), which is true if all entries can be reduced here, and LIBRARY(f, x)
- * for other entries; without LIBRARY only functions that do not use it are defined.
+ * The file is included once per form, with FEW or LANES defined for two of them. The macros of a form
+ * are NAME(f), QUALIFIERS, INNER (qualifiers of inlined functions), REAL and INTEGER, BITS(real) and
+ * REAL_OF(integer), which reinterpret bits, MASK(comparison) with all bits of a true entry set, ROOT,
+ * SMALL(real), which is true if all entries can be reduced here, and LIBRARY(f, x) for other entries;
+ * without LIBRARY only functions that do not use it are defined.
  */
+#if defined(FEW)
+
+/* FEW numbers of one solve, two or four. */
+#ifndef FEW_NAMED
+#define FEW_JOINED(f, count) own_##f##_##count
+#define FEW_NAMED(f, count) FEW_JOINED(f, count)
+#endif
+
+typedef double FEW_NAMED(reals, FEW) __attribute__((vector_size(FEW * 8)));
+typedef int64_t FEW_NAMED(whole, FEW) __attribute__((vector_size(FEW * 8)));
+
+/* No function has a vector argument, because calling conventions for vectors differ by machine. */
+#define NAME(f) FEW_NAMED(f, FEW)
+#define QUALIFIERS static inline __attribute__((always_inline, unused))
+#define INNER QUALIFIERS
+#define REAL FEW_NAMED(reals, FEW)
+#define INTEGER FEW_NAMED(whole, FEW)
+#define BITS(x) ((INTEGER) (x))
+#define REAL_OF(bits) ((REAL) (bits))
+#define MASK(comparison) ((INTEGER) (comparison))
+
+#elif defined(LANES)
+
+/* A number of each solve in lanes (lanes.c). */
+#define NAME(f) lanes_##f
+#define QUALIFIERS static __attribute__((unused, noinline)) LANES_TARGET
+#define INNER static inline __attribute__((always_inline, unused)) LANES_TARGET
+#define REAL lanes
+#define INTEGER lane_mask
+#define BITS(x) ((lane_mask) (x))
+#define REAL_OF(bits) ((lanes) (bits))
+#define MASK(comparison) ((lane_mask) (comparison))
+#define ROOT(x) lanes_sqrt(x)
+#define SMALL(x) lanes_all((lane_mask) (lanes_fabs(x) < SPREAD(5e8)))
+#define LIBRARY(f, x) lanes_alone_##f(x)
+
+#else
+
+/* One number; emitted code calls these functions instead of the C library. */
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+static inline int64_t own_bits(double x) {
+  int64_t bits;
+  memcpy(&bits, &x, sizeof bits);
+  return bits;
+}
+
+static inline double own_double(int64_t bits) {
+  double x;
+  memcpy(&x, &bits, sizeof x);
+  return x;
+}
+
+#define NAME(f) own_##f
+#define QUALIFIERS static __attribute__((unused))
+#define INNER static inline __attribute__((always_inline, unused))
+#define REAL double
+#define INTEGER int64_t
+#define BITS(x) own_bits(x)
+#define REAL_OF(bits) own_double(bits)
+#define MASK(comparison) (-(int64_t) (comparison))
+#define ROOT(x) sqrt(x)
+#define SMALL(x) (fabs(x) < 5e8)
+#define LIBRARY(f, x) f(x)
+
+#endif
+
 #define ALL(number) ((REAL) {0} + (number))
 #define PICK(mask, yes, no) REAL_OF(((mask) & BITS(yes)) | (~(mask) & BITS(no)))
 

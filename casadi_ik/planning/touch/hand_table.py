@@ -398,7 +398,7 @@ def _finger_of(table: HandTable, link: str) -> int | None:
     return robot.finger_names.index(moving_fingers[0]) if moving_fingers else None
 
 
-TouchJob = c_struct("touch_job", {"3": 3, "4": 4, "BINS": BINS})
+TouchJob = c_struct("touch_job", {"3": 3, "4": 4, "BINS": BINS}, "touch")
 SnapJob = c_struct("snap_job", driver="snap")
 
 

@@ -207,7 +207,7 @@ def touch_library() -> Any:
         WIDE if machine_lanes() else "",
         "typedef double scalar;\ntypedef double real;\n",
         define({"STEP_IN": 0, "STEP_OUT": 0}),
-        *(driver_text(name) for name in ("common", "touch_job", "touch", "loads", "nearest")),
+        *(driver_text(name) for name in ("common", "touch", "loads", "nearest")),
     )
     text = "".join(sources)
     library = load_library("touch", lambda: text, "casadi_ik_touch", text)

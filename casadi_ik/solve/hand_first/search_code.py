@@ -405,7 +405,6 @@ def search_dtype(plan: SearchPlan) -> list[Any]:
 
 def _library_text(plan: SearchPlan, wide: bool) -> str:
     """Return the C text of the library."""
-    jobs = (driver_text(name) for name in ("loop_job", "map_job", "lookup_job"))
     pointers = "".join(f"  int (*{name})({job} *);\n" for name, job in KERNELS.items())
     calls = "".join(f"#define {name.upper()}(work) (job->{name})(work)\n" for name in KERNELS)
     count = len(plan.sides)
@@ -417,7 +416,7 @@ def _library_text(plan: SearchPlan, wide: bool) -> str:
             WIDE if wide else "",
             "#include <math.h>\n#include <stdint.h>\n#include <string.h>\n",
             define(codes | {"FOREVER": NO_LIMIT}),
-            *jobs,
+            driver_text("jobs"),
             f"typedef struct {{\n{plan.members()}",
             f"  const int16_t *tiles[3];\n{sides}{pointers}}} search;\n",
             f"{calls}#define TILES(table) (job->tiles[table])\n",
