@@ -149,7 +149,7 @@ class TeleoperationNlp:
         cost = 0.02 * ca.sumsqr(x) + 0.1 * ca.sumsqr(x - last)
         for side in robot.description.sides:
             pose = ca.SX.sym(side.name, 3, 4)
-            palm = links[side.palm_link].at(side.palm_placement)
+            palm = links[side.palm_link].compose(side.palm_placement)
             pose_parameters.append(ca.vec(pose))
             turn = palm.rotation @ pose[:, :3].T
             axis = ca.vertcat(

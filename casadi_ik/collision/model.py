@@ -188,7 +188,7 @@ def shape_poses(robot: RobotDescription, q: ca.SX) -> ca.SX:
         ]
     for solid in robot.shapes.solids:
         pose, placement = movable_link(solid.link)
-        solid_pose = pose.at(placement @ solid.pose)
+        solid_pose = pose.compose(placement @ solid.pose)
         rows += [ca.vec(solid_pose.rotation.T), solid_pose.origin]
     return ca.densify(ca.vertcat(ca.SX(0, 1), *rows))
 

@@ -128,7 +128,7 @@ class DriverCode(IntEnum):
         SLICE_OVER: `SLICE` is over; call again.
         ROWS_FULL: The memory for logged rows is full; fetch the rows and call again.
         CONTINUES: A further start of the solve is written.
-        FEW_LEFT: Too few solves are left to fill the lanes.
+        FEW_LEFT: Too few solves remain to fill the lanes.
         NO_MEMORY: Work memory could not be allocated.
     """
 

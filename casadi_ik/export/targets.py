@@ -61,7 +61,7 @@ def example_target(robot: ArmHand) -> ExampleTarget:
     if names:
         grasp = load_grasp(names[0])
         points, normals = grasp.arrays(robot.fingers)
-        if not np.isnan(points).any() and not grasp.more(robot.fingers):
+        if not np.isnan(points).any() and not grasp.extra_vectors(robot.fingers):
             return ExampleTarget(f"Solves the shipped grasp {names[0]}.", points, normals)
     return ExampleTarget(
         "Solves the contacts of the home configuration.", *robot.contacts(robot.home)

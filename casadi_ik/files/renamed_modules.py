@@ -1,4 +1,4 @@
-"""Old import paths of documented modules, and warnings of deprecated names, until version 0.3."""
+"""Deprecated names, and old import paths of documented modules: both warn until version 0.3."""
 
 from __future__ import annotations
 
@@ -92,12 +92,11 @@ def install() -> None:
     sys.meta_path.insert(0, RenamedModuleFinder())  # type: ignore[arg-type]
 
 
-def warn_renamed(old: str, new: str, stacklevel: int) -> None:
-    """Warn that a name is deprecated.
+def warn_renamed(old: str, new: str) -> None:
+    """Warn the caller of a deprecated method or property.
 
     Args:
         old: Deprecated name.
         new: Name to use instead.
-        stacklevel: Stack level of the caller's caller, as for `warnings.warn`.
     """
-    warnings.warn(f"{old} is deprecated; use {new}", DeprecationWarning, stacklevel=stacklevel)
+    warnings.warn(f"{old} is deprecated; use {new}", DeprecationWarning, stacklevel=3)

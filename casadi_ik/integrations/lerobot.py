@@ -112,7 +112,7 @@ class ArmKinematics:
         position = self._solver.tolerances[finger].position
         ratio = math.sqrt(position_weight / orientation_weight)
         tolerance = Tolerance(position, min(position * ratio, MAX_ANGLE_TOLERANCE))
-        return Grasp({finger: dataclasses.replace(Contact.at(tip), tolerance=tolerance)})
+        return Grasp({finger: dataclasses.replace(Contact.from_pose(tip), tolerance=tolerance)})
 
 
 def _contacts_of(points: dict[str, list[float]], normals: dict[str, list[float]]) -> Grasp | None:

@@ -26,7 +26,7 @@ class Pose:
     rotation: ca.SX
     origin: ca.SX
 
-    def at(self, placement: Array) -> Pose:
+    def compose(self, placement: Array) -> Pose:
         """Return the frame with the constant pose `placement` (4, 4) relative to this frame."""
         rotation, origin = _constants(placement)
         return Pose(self.rotation @ rotation, self.origin + self.rotation @ origin)
@@ -59,12 +59,12 @@ class Kinematics:
     @property
     def palm(self) -> Pose:
         """Pose of the palm frame."""
-        return self.links[self.robot.palm_link].at(self.robot.palm_placement)
+        return self.links[self.robot.palm_link].compose(self.robot.palm_placement)
 
     def contact_frame(self, finger: str) -> Pose:
         """Return the pose of a finger's contact frame."""
         entry = self.robot.finger(finger)
-        return self.links[entry.link].at(entry.placement)
+        return self.links[entry.link].compose(entry.placement)
 
     def contact(self, finger: str) -> tuple[ca.SX, ca.SX]:
         """Return a finger's contact point (3, 1) [m] and outward pad normal (3, 1), base frame."""
@@ -117,7 +117,7 @@ def forward(robot: RobotDescription, theta: ca.SX) -> Kinematics:
     links = {robot.root: Pose(ca.SX.eye(3), ca.SX.zeros(3, 1))}
     axes: dict[str, ca.SX] = {}
     for joint in robot.joints:
-        frame = links[joint.parent].at(joint.placement)
+        frame = links[joint.parent].compose(joint.placement)
         if joint.type != "fixed":
             axes[joint.name] = frame.rotate(joint.axis)
             frame = _displaced_frame(frame, joint, theta[index[joint.name]])

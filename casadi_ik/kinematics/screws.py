@@ -69,7 +69,7 @@ class ScrewChain:
     screws: tuple[Screw, ...]
     reference: Array
 
-    def at(self, theta: Expr) -> ChainScrews:
+    def evaluate(self, theta: Expr) -> ChainScrews:
         """Return the chain with its joints at theta (len(joints), 1) [rad or m]."""
         return ChainScrews(self, theta)
 
@@ -134,7 +134,7 @@ def screw_chain_to_contact(robot: RobotDescription, finger: str) -> ScrewChain:
 def _chain(robot: RobotDescription, link: str, placement: Array) -> ScrewChain:
     reference = forward(robot, ca.SX.zeros(len(robot.movable), 1))
     joints = [joint for joint in robot.chain(link) if joint.type != "fixed"]
-    end = reference.links[link].at(placement)
+    end = reference.links[link].compose(placement)
     return ScrewChain(
         joints=tuple(joint.name for joint in joints),
         screws=tuple(
@@ -165,7 +165,7 @@ class TipChain:
     chain: ScrewChain
     signs: tuple[int, ...]
 
-    def at(self, q: Expr) -> TipMotion:
+    def evaluate(self, q: Expr) -> TipMotion:
         """Return the chain with the actuators at q (n, 1) [rad or m]."""
         return TipMotion(self, q)
 
@@ -221,7 +221,9 @@ class TipMotion:
     def screws(self) -> ChainScrews:
         """Screws of the chain at this configuration: eqs. (3), (5) to (7)."""
         pairs = zip(self.tip.signs, self.tip.chain.joints, strict=True)
-        return self.tip.chain.at(ca.vertcat(*(sign * self.joints[name] for sign, name in pairs)))
+        return self.tip.chain.evaluate(
+            ca.vertcat(*(sign * self.joints[name] for sign, name in pairs))
+        )
 
     @property
     def pose(self) -> Expr:

@@ -58,5 +58,5 @@ if not TYPE_CHECKING:  # type checkers report deprecated names as unknown
         if name not in _RENAMED:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         new = _RENAMED[name]
-        warn_renamed(f"casadi_ik.logs.{name}", f"casadi_ik.logs.{new}", stacklevel=3)
+        warn_renamed(f"casadi_ik.logs.{name}", f"casadi_ik.logs.{new}")
         return globals()[new]

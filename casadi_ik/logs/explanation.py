@@ -77,7 +77,7 @@ class Explanation:
     @property
     def met(self) -> tuple[str, ...]:
         """Deprecated name of `incidents`."""
-        warn_renamed("Explanation.met", "Explanation.incidents", stacklevel=3)
+        warn_renamed("Explanation.met", "Explanation.incidents")
         return self.incidents
 
 

@@ -77,7 +77,7 @@ class LogClock:
     @property
     def room(self) -> int:
         """Deprecated name of `max_iterations`."""
-        warn_renamed("LogClock.room", "LogClock.max_iterations", stacklevel=3)
+        warn_renamed("LogClock.room", "LogClock.max_iterations")
         return self.max_iterations
 
     def check(self, first: int, count: int) -> None:

@@ -148,13 +148,13 @@ class SolveRecord(RecordReprMixin):
     @property
     def asked(self) -> LoggedTarget:
         """Deprecated name of `target`."""
-        warn_renamed("SolveRecord.asked", "SolveRecord.target", stacklevel=3)
+        warn_renamed("SolveRecord.asked", "SolveRecord.target")
         return self.target
 
     @property
     def stretches(self) -> tuple[PhaseSpan, ...]:
         """Deprecated name of `phase_spans`."""
-        warn_renamed("SolveRecord.stretches", "SolveRecord.phase_spans", stacklevel=3)
+        warn_renamed("SolveRecord.stretches", "SolveRecord.phase_spans")
         return self.phase_spans
 
     @property

@@ -28,12 +28,12 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
     """Base class of couplings.
 
     Attributes:
-        of: Name of the actuator or joint that is followed.
-        source_unit: Unit of the followed coordinate; "" for any.
+        of: Name of the actuator or joint that determines the position.
+        source_unit: Unit of the source, the position of `of`; "" for any.
         lengths: Names of the fields that are lengths [m].
         angles: Names of the fields that are angles [rad]. Calibration estimates lengths and angles.
-        monotone: True if the joint position is a monotone function of the followed coordinate.
-        periodic: True if the joint position is periodic in the followed angle.
+        monotone: True if the joint position is a monotone function of the source.
+        periodic: True if the joint position is periodic in the angle of the source.
     """
 
     of: str
@@ -75,7 +75,7 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
 
     @property
     def stroke(self) -> tuple[float, float]:
-        """Limits of the followed coordinate due to the mechanism; infinite if there are none."""
+        """Limits of the source due to the mechanism; infinite if there are none."""
         return -math.inf, math.inf
 
     @property
@@ -88,8 +88,8 @@ class CouplingKind(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_
         """Ratio and offset of a linear coupling; None for any other."""
         return None
 
-    def followed(self, source: Array) -> Array:
-        """Return positions (k,) of the joint [rad or m] for those of the followed coordinate.
+    def joint_position(self, source: Array) -> Array:
+        """Return positions (k,) of the joint [rad or m] for positions of the source.
 
         The NumPy version of the graph of the coupling, for checks before any graph is built.
         """
@@ -117,7 +117,7 @@ class Linear(CouplingKind, frozen=True, tag="linear"):
         """Ratio and offset."""
         return self.ratio, self.offset
 
-    def followed(self, source: Array) -> Array:
+    def joint_position(self, source: Array) -> Array:
         """Return positions (k,) of the joint."""
         return self.ratio * source + self.offset
 
@@ -152,7 +152,7 @@ class LeadScrew(CouplingKind, frozen=True, tag="lead-screw"):
         low, high = self.stroke
         return f"|b - c| = {low:.6g} and b + c = {high:.6g} m"
 
-    def followed(self, source: Array) -> Array:
+    def joint_position(self, source: Array) -> Array:
         """Return positions (k,) of the joint; see `kinematics.mechanisms.angle_from_slider`."""
         short, long, flat = self.b - self.c, self.b + self.c, FLAT * self.b * self.c
         low = np.maximum((source - short) * (source + short), flat)
@@ -200,7 +200,7 @@ class FourBar(CouplingKind, frozen=True, tag="four-bar"):
                 f"expected a pose in which the linkage closes, neither stretched nor folded"
             )
 
-    def followed(self, source: Array) -> Array:
+    def joint_position(self, source: Array) -> Array:
         """Return positions (k,) of the joint, on the branch of the reference pose."""
         reference = np.array([self.phi_0])
         branch = min(
@@ -243,7 +243,7 @@ class Polynomial(CouplingKind, frozen=True, tag="polynomial"):
                 f"{location}.coefficients: all but the first are zero; expected a joint that moves"
             )
 
-    def followed(self, source: Array) -> Array:
+    def joint_position(self, source: Array) -> Array:
         """Return positions (k,) of the joint."""
         value = np.polynomial.polynomial.polyval(source, self.coefficients)
         return np.asarray(value, dtype=np.float64)

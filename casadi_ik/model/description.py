@@ -395,7 +395,7 @@ class RobotDescription:
             palm_link=side.palm_link,
             palm_placement=side.palm_placement,
             home=self.home[sorted(motors)],
-            shapes=self.shapes.without(set(self.links) - links - {root}),
+            shapes=self.shapes.remove_links(set(self.links) - links - {root}),
             sides=(),
             trunk=(),
             trunk_link="",

@@ -15,6 +15,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools, read_only
 from casadi_ik.files.input_checks.numbers import warn_of_wide_tolerance
 from casadi_ik.files.input_checks.poses import MAX_SKEW, single_pose
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.model.pose import Free, inverse
 
 
@@ -243,12 +244,29 @@ class Contact:
         for name, vector in vectors.items():
             object.__setattr__(self, name, vector)
 
-    def at(self: Any, pose: ArrayLike | None = None) -> Contact:
-        """Return the contact transformed from a frame into the base frame.
+    @classmethod
+    def from_pose(cls, pose: ArrayLike) -> Contact:
+        """Return a contact that constrains the whole pose of a fingertip.
 
-        Called on the class, ``Contact.at(pose)`` is a contact with the whole pose of a fingertip:
-        the point is the pose's origin, the normal its first axis, the tangent its second, as in
+        The point is the pose's origin, the normal its first axis and the tangent its second, as in
         `ArmHand.contact_frames`.
+
+        Args:
+            pose: (4, 4) pose of the contact frame.
+
+        Raises:
+            InputError: The pose is not a rigid motion.
+
+        Example:
+            >>> contact = ik.Contact.from_pose(np.eye(4))
+            >>> print(contact.normal, contact.tangent)
+            [1. 0. 0.] [0. 1. 0.]
+        """
+        motion = single_pose(pose)
+        return cls(motion[:3, 3], motion[:3, 0], tangent=motion[:3, 1])
+
+    def transformed(self, pose: ArrayLike) -> Contact:
+        """Return the contact transformed from a frame into the base frame.
 
         Args:
             pose: (4, 4) pose of the frame in which this contact is given.
@@ -259,13 +277,9 @@ class Contact:
         Example:
             >>> pose = np.eye(4)
             >>> pose[:3, 3] = [1.0, 0.0, 0.0]
-            >>> print(ik.Contact([0.0, 0.0, 0.5]).at(pose).point)
+            >>> print(ik.Contact([0.0, 0.0, 0.5]).transformed(pose).point)
             [1.  0.  0.5]
-            >>> print(ik.Contact.at(pose).normal, ik.Contact.at(pose).tangent)
-            [1. 0. 0.] [0. 1. 0.]
         """
-        if pose is None or not isinstance(self, Contact):
-            return Contact(np.zeros(3), [1, 0, 0], tangent=[0, 1, 0]).at(single_pose(self))
         motion = single_pose(pose)
         rotation = motion[:3, :3]
         if not np.isfinite(self.point).all():
@@ -274,6 +288,13 @@ class Contact:
         vectors = {name: getattr(self, name) for name in ("normal", *EXTRA_VECTORS)}
         rotated = {name: rotation @ v for name, v in vectors.items() if v is not None}
         return Contact(rotation @ self.point + motion[:3, 3], tolerance=self.tolerance, **rotated)
+
+    def at(self: Any, pose: ArrayLike | None = None) -> Contact:
+        """Return `transformed(pose)`, or `from_pose(pose)` if called on the class; deprecated."""
+        is_instance = isinstance(self, Contact) and pose is not None
+        name = "transformed" if is_instance else "from_pose"
+        warn_renamed("Contact.at", f"Contact.{name}")
+        return self.transformed(pose) if is_instance else Contact.from_pose(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,7 +396,9 @@ class Grasp:
             object_pose = motion @ object_pose
         elif self.object:
             object_pose = motion
-        contacts = {finger: contact.at(motion) for finger, contact in self.contacts.items()}
+        contacts = {
+            finger: contact.transformed(motion) for finger, contact in self.contacts.items()
+        }
         palm = self.palm
         if isinstance(palm, Mapping):
             palm = {side: motion @ side_pose for side, side_pose in palm.items()}
@@ -444,7 +467,7 @@ class Grasp:
         ]
         return np.array(points), np.array(normals)
 
-    def more(self, fingers: Sequence[str]) -> dict[str, Array]:
+    def extra_vectors(self, fingers: Sequence[str]) -> dict[str, Array]:
         """Return the vectors of the contacts besides point and normal.
 
         Args:
@@ -455,7 +478,7 @@ class Grasp:
             that no contact has are omitted.
 
         Example:
-            >>> grasp.more(robot.fingers)  # this grasp has points and normals only
+            >>> grasp.extra_vectors(robot.fingers)  # this grasp has points and normals only
             {}
         """
         arrays: dict[str, Array] = {}
@@ -466,6 +489,11 @@ class Grasp:
                     rows = arrays.setdefault(f"{name}s", np.full((len(fingers), 3), np.nan))
                     rows[fingers.index(finger)] = vector
         return arrays
+
+    def more(self, fingers: Sequence[str]) -> dict[str, Array]:
+        """Return `extra_vectors(fingers)`; deprecated."""
+        warn_renamed("Grasp.more", "Grasp.extra_vectors")
+        return self.extra_vectors(fingers)
 
 
 def _frozen_palms(palm: Any) -> Array | Mapping[str, Array]:

@@ -259,7 +259,7 @@ class _PartJoints:
         if joint.coupling is not None:
             source = self._fixed_position(joint.coupling.of)
             if source is not None:
-                return float(joint.coupling.followed(np.array([source]))[0])
+                return float(joint.coupling.joint_position(np.array([source]))[0])
             if isinstance(joint.coupling, Linear) and joint.coupling.ratio == 0:
                 return joint.coupling.offset
         limits = self._stated.get(name, joint.limits)
@@ -281,7 +281,7 @@ class _PartJoints:
             return limits
         if joint.coupling is not None:  # the range of the leader determines that of the follower
             low, high = self._limits(joint.coupling.of)
-            values = joint.coupling.followed(np.linspace(low, high, FOLLOWER_GRID))
+            values = joint.coupling.joint_position(np.linspace(low, high, FOLLOWER_GRID))
             slack = 1e-6 + 1e-3 * float(np.ptp(values))
             return float(values.min()) - slack, float(values.max()) + slack
         if joint.type == "continuous":

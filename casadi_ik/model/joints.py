@@ -31,7 +31,8 @@ class Joint:
         lower: Lower limit [rad or m].
         upper: Upper limit [rad or m].
         velocity: Velocity limit [rad/s or m/s], inf if unknown.
-        coupling: Coupling to an actuator or another joint; None if the joint is its own actuator.
+        coupling: Coupling to an actuator or another joint; None for a joint that an actuator drives
+            directly.
         part: "arm", "mount" or "hand".
         effort: Largest torque or force [N m or N], inf if unknown.
     """
@@ -241,7 +242,7 @@ def joint_positions(joints: Iterable[Joint], motors: Mapping[str, ArrayLike]) ->
         if name not in positions:
             coupling = by_name[name].coupling
             assert coupling is not None, f"joint {name!r} has no motor"
-            positions[name] = coupling.followed(position(coupling.of))
+            positions[name] = coupling.joint_position(position(coupling.of))
         return positions[name]
 
     return {name: position(name) for name in by_name}

@@ -145,7 +145,7 @@ class Shapes:
             self.touching,
         )
 
-    def without(self, links: Collection[str]) -> Shapes:
+    def remove_links(self, links: Collection[str]) -> Shapes:
         """Return the shapes without those of some links."""
         remaining = [i for i, solid in enumerate(self.solids) if solid.link not in links]
         new_index = {old: new for new, old in enumerate(remaining)} | {-1: -1}
@@ -159,14 +159,14 @@ class Shapes:
             self.touching,
         )
 
-    def __add__(self, other: Shapes) -> Shapes:
+    def __add__(self, added: Shapes) -> Shapes:
         shift = len(self.solids)
         shifted = tuple(
             replace(item, covers=item.covers + shift) if item.covers >= 0 else item
-            for item in other.capsules
+            for item in added.capsules
         )
         return Shapes(
-            self.capsules + shifted, self.solids + other.solids, self.touching + other.touching
+            self.capsules + shifted, self.solids + added.solids, self.touching + added.touching
         )
 
 

@@ -40,7 +40,7 @@ class ToleranceEntry(Struct, frozen=True):
 
 
 class ContactEntry(Struct, frozen=True):
-    """A contact of a finger; ``direction`` excludes the other keys, all of which need a point.
+    """A contact of a finger; ``direction`` excludes the other keys, which require a point.
 
     Attributes:
         point: Contact point in the robot's base frame, or in an object's frame if its pose is given

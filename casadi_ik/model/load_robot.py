@@ -111,7 +111,7 @@ def _robot(path: Path) -> RobotDescription:
         robot = _single_hand_robot(top, units, path)
     # Shapes of the description override those of imported files.
     overridden = () if top.collision is None else top.collision.links
-    shapes = robot.shapes.without(overridden) + link_shapes(top.collision, robot.links, path)
+    shapes = robot.shapes.remove_links(overridden) + link_shapes(top.collision, robot.links, path)
     return replace(robot, shapes=shapes, path=path)
 
 

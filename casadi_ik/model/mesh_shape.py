@@ -134,10 +134,10 @@ def _simple(shape: Element, path: Path) -> Triangles:
 
 def _mesh_file(name: str, path: Path) -> Path | None:
     """Return the file of a mesh, relative to the URDF or in a ROS package; None if missing."""
-    scheme, _, inside = name.partition("://")
+    scheme, _, path_in_package = name.partition("://")
     paths = [path.parent / name.removeprefix("file://")]
     if scheme in ("package", "model"):
-        package, _, mesh = inside.partition("/")
+        package, _, mesh = path_in_package.partition("/")
         folders = [folder for group in package_folders(package, path) for folder in group]
         paths = [folder / mesh for folder in folders]
         paths += [path.parent / mesh, path.parent / Path(mesh).name]

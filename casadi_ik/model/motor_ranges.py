@@ -94,7 +94,7 @@ def _position_map(
     if coupling is None:
         return maps[joint.name]
     source = maps[coupling.of]
-    return lambda q: coupling.followed(source(q))
+    return lambda q: coupling.joint_position(source(q))
 
 
 def _feasible_interval(

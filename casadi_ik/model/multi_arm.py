@@ -108,7 +108,7 @@ def body_from_parts(
             pose = base.tip @ frame_matrix(entry.at or Frame())
             joints.append(fixed_joint(f"{name}_base", base.tip_link, arm.root, pose))
         elif sides or trunk is not None:
-            arm = replace(arm, shapes=arm.shapes.without([shared]))
+            arm = replace(arm, shapes=arm.shapes.remove_links([shared]))
         mount_joint = fixed_joint(f"{name}_mount", arm.tip_link, side_hand.root, arm.tip @ mount)
         joints += [*arm.joints, mount_joint, *side_hand.joints]
         parts += [(f"{name}.{part.name}", part) for part in (arm, side_hand)]

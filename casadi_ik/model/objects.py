@@ -63,7 +63,7 @@ class ObjectFile(Struct, frozen=True):
         name: Name.
         description: Description in one sentence.
         frame: Location of its frame, in words; z points up when the object stands.
-        shape: Shape, centred in the object's frame; a mesh is in its own frame.
+        shape: Shape, centred in the object's frame; a mesh keeps the frame of its file.
         mass: Mass and its source.
         sources: Sources of numbers by tag.
     """
@@ -84,7 +84,7 @@ class GraspObject:
         name: Name of the description.
         description: Description in one sentence.
         frame: Location of the object frame, in words; z points up when the object stands.
-        shape: Primitive, centred in the object frame, or mesh in its own frame.
+        shape: Primitive, centred in the object frame, or mesh in the frame of its file.
         mass: Mass [kg]; NaN if unknown.
         sources: Sources of the numbers by tag.
     """

@@ -192,9 +192,9 @@ def prefix_side(part: RobotPart, side: str, shared_link: str | None = None) -> R
 def mirrored(part: RobotPart) -> RobotPart:
     """Return the mirror image of a part, in which y is inverted in the frame of its root.
 
-    Every frame is mirrored in its own y. The axis of a joint is mirrored, too; if the opposite axis
-    is closer to the original one, the joint uses that one and its positions change sign, unless it
-    has a coupling that is not linear.
+    Every frame is mirrored in y of that frame. The axis of a joint is mirrored, too; if the
+    opposite axis is closer to the original one, the joint uses that one and its positions change
+    sign, unless it has a coupling that is not linear.
     """
     nonlinear = [j for j in part.joints if j.coupling and not isinstance(j.coupling, Linear)]
     unchanged = {j.name for j in nonlinear} | {j.coupling.of for j in nonlinear if j.coupling}

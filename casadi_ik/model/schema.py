@@ -261,8 +261,8 @@ class ArmFile(_PartFile, frozen=True, kw_only=True):
 class HandFile(_PartFile, frozen=True, kw_only=True):
     """A hand: ``models/hands/*.yaml``.
 
-    ``thumb``, ``mount`` and ``home`` apply to robots that are loaded as ARM+HAND; robots with a
-    file of their own state these keys there.
+    ``thumb``, ``mount`` and ``home`` apply to robots that are loaded as ARM+HAND; a robot
+    file states these keys itself.
 
     Attributes:
         palm: Frame of the palm: z away from it, y towards the thumb.
@@ -358,7 +358,7 @@ class ImportedFile(_SingleHandRobot, frozen=True, kw_only=True):
 
     Attributes:
         fingers: Contact frame by finger, which URDF and MJCF do not state.
-        hand: Hand in a file of its own.
+        hand: Hand in a separate file.
         robot: Whole robot in one file; excludes ``arm``.
     """
 

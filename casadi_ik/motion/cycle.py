@@ -431,7 +431,7 @@ class Cycle:
         rows = [contact_residual(self.robot, self.contacts, q, p)]
         links = actuated(self.robot, q).kinematics.links
         for side, (link, placement) in self.palms.items():
-            palm, weight = links[link].at(placement), p[side_name("palm_weight", side)]
+            palm, weight = links[link].compose(placement), p[side_name("palm_weight", side)]
             rows.append(weight[0] * (palm.origin - p[side_name("palm_point", side)]) / LENGTH)
             axes_error = palm.rotation - p[side_name("palm_axes", side)]
             rows.append(weight[1] * ca.vec(axes_error))
@@ -442,7 +442,7 @@ class Cycle:
         rows, body = list[Expr](), actuated(self.robot, q)
         for side, (link, placement) in self.palms.items():
             palm, weight = (
-                body.kinematics.links[link].at(placement),
+                body.kinematics.links[link].compose(placement),
                 p[side_name("palm_weight", side)],
             )
             linear, angular = body.twist(link, palm.origin, range(q.numel()))

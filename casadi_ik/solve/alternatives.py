@@ -134,7 +134,7 @@ class AlternativeFinder:
         body, values = actuated(robot, q), list[ca.SX]()
         arms = [arm for arm, _ in robot.side_actuators] or [self._arm_motors]
         for carrier, arm in zip(robot.sides or [robot], arms, strict=True):
-            palm = body.kinematics.links[carrier.palm_link].at(carrier.palm_placement)
+            palm = body.kinematics.links[carrier.palm_link].compose(carrier.palm_placement)
             jacobian = ca.vertcat(*body.twist(carrier.palm_link, palm.origin, arm))
             values.append(manipulability(jacobian))
         measure = ca.mmin(ca.vertcat(*values))

@@ -343,7 +343,7 @@ class TargetBuilder:
         # The constructor of a contact has checked it.
         fingers = self.robot.fingers
         arrays = [grasp.arrays(fingers) for grasp in grasps]
-        vectors = [grasp.more(fingers) for grasp in grasps]
+        vectors = [grasp.extra_vectors(fingers) for grasp in grasps]
         # Adding a dimension is free; stacking takes as long as solving one grasp.
         points, normals = (
             (arrays[0][0][None], arrays[0][1][None])

@@ -27,6 +27,8 @@ PLAIN = {
     "ArmHand.beyond_limits",  # three numbers as errors has them
     "ArmHand.deviations",
     "ArmHand.toggle_margins",
+    "Contact.at",  # deprecated
+    "Grasp.more",  # deprecated
     "ArmHand.view",  # a server and a browser; tests/viewing has them
     "papers.ScrewControl.stepper",  # as Solver.stepper
     "logs.Log.attachment",

@@ -35,8 +35,8 @@ FINGERS = ("a", "b", "c", "d", "free")
 
 
 def assert_same(grasp: ik.Grasp, other_grasp: ik.Grasp) -> None:
-    arrays = (*grasp.arrays(FINGERS), *grasp.more(FINGERS).values())
-    other_arrays = (*other_grasp.arrays(FINGERS), *other_grasp.more(FINGERS).values())
+    arrays = (*grasp.arrays(FINGERS), *grasp.extra_vectors(FINGERS).values())
+    other_arrays = (*other_grasp.arrays(FINGERS), *other_grasp.extra_vectors(FINGERS).values())
     for left, right in zip(arrays, other_arrays, strict=True):
         np.testing.assert_allclose(left, right, atol=1e-12)
 
@@ -100,3 +100,14 @@ def test_grasp_moves_with_its_object(robot):
 def test_malformed_poses_are_refused(pose, says):
     with pytest.raises(ik.errors.InputError, match=says):
         ALL_KINDS.at(pose)
+
+
+def test_deprecated_names_return_the_same_as_the_new_ones():
+    contact, pose = ALL_KINDS.contacts["a"], pose_of([1.0, 0.0, 0.2], [0.3, 0.1, 2.0])
+    with pytest.warns(DeprecationWarning, match="transformed"):
+        assert np.array_equal(contact.at(pose).point, contact.transformed(pose).point)
+    with pytest.warns(DeprecationWarning, match="from_pose"):
+        whole_pose = ik.Contact.at(pose)
+    assert np.array_equal(whole_pose.tangent, ik.Contact.from_pose(pose).tangent)
+    with pytest.warns(DeprecationWarning, match="extra_vectors"):
+        assert ALL_KINDS.more(FINGERS).keys() == ALL_KINDS.extra_vectors(FINGERS).keys()

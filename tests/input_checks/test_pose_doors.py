@@ -85,7 +85,7 @@ def frame_of_data_set() -> Array:
 MATRICES: dict[str, Callable[[Array], Array]] = {
     "pose": lambda R: checked_pose(pose_of(R))[:3, :3],
     "poses": lambda R: checked_pose(np.stack([np.eye(4), pose_of(R)]))[1, :3, :3],
-    "fingertip": lambda R: frame_of(ik.Contact.at(pose_of(R))),
+    "fingertip": lambda R: frame_of(ik.Contact.from_pose(pose_of(R))),
     "contact": lambda R: frame_of(CONTACT.at(pose_of(R))),
     "axes of a contact": lambda R: frame_of(
         ik.Contact(POINT, normal=R[:, 0], tangent=R[:, 1]) if matrix_skew(R) < 1 else CONTACT

@@ -191,7 +191,7 @@ def test_local_descent_does_not_jump_to_limits():
     robot = ik.load_robot("ur5e")
     frame = robot.contact_frames(robot.home)[0].copy()
     frame[:3, 3] = 9.0
-    grasp = ik.Grasp({robot.fingers[0]: ik.Contact.at(frame)})
+    grasp = ik.Grasp({robot.fingers[0]: ik.Contact.from_pose(frame)})
     solver = ik.Solver(robot)
     local = solver.solve(grasp, diagnose=False, best_effort="local")
     nearest = solver.solve(grasp, diagnose=False, best_effort=True)
@@ -208,7 +208,7 @@ def test_five_axis_arm_follows_infeasible_poses():
     for step in range(1, 21):
         pose = frame.copy()
         pose[1, 3] += 5e-3 * step
-        grasp = ik.Grasp({robot.fingers[0]: ik.Contact.at(pose)})
+        grasp = ik.Grasp({robot.fingers[0]: ik.Contact.from_pose(pose)})
         solution = solver.solve(grasp, q0=q, fixed=fixed, diagnose=False, best_effort="local")
         if step > 2:
             assert solution.status is ik.Status.NEAREST

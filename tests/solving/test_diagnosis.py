@@ -137,7 +137,7 @@ def test_diagnosis_uses_the_object_pose(solver: ik.Solver) -> None:
     grasp = ik.load_grasp("cup")
     up = np.eye(4)
     up[2, 3] = 0.15
-    contacts = {**grasp.contacts, "finger_2": grasp.contacts["finger_2"].at(up)}
+    contacts = {**grasp.contacts, "finger_2": grasp.contacts["finger_2"].transformed(up)}
     grasp_with_object = replace(grasp, contacts=contacts)
     assert grasp_with_object.object_pose is not None
     diagnosis = solver.solve(grasp_with_object).diagnosis

@@ -87,7 +87,7 @@ def test_arm_with_a_tool():
     assert solver.solve_batch(points, normals).success.all()
     assert solver.solve_batch(points, np.full_like(normals, np.nan), q0=robot.home).success.all()
     frame = robot.contact_frames(q[0])[0]
-    tip = ik.Contact.at(frame)
+    tip = ik.Contact.from_pose(frame)
     solution = solver.solve(ik.Grasp({"tip": tip}))
     np.testing.assert_allclose(robot.contact_frames(solution.q)[0], frame, atol=1e-2)
     assert len(solver.solve_all(ik.Grasp({"tip": tip}))) > 1

@@ -58,7 +58,7 @@ def evaluated(*expressions, q, at):
 def twist_by_differences(tip: TipChain, at: np.ndarray, step: float = 1e-6) -> np.ndarray:
     """Columns [v; w] = 2 x' x* over all actuators, x' by central differences."""
     q = ca.SX.sym("q", len(at))
-    pose = ca.Function("pose", [q], [tip.at(q).pose])
+    pose = ca.Function("pose", [q], [tip.evaluate(q).pose])
     columns = []
     for offset in step * np.eye(len(at)):
         rate = (pose(at + offset) - pose(at - offset)) / (2 * step)
@@ -99,7 +99,7 @@ def test_eqs_3_to_7_12_finger_jacobians_are_the_tips_twist(kind, toy, robot, rng
     q = ca.SX.sym("q", len(body.actuators))
     for finger in body.fingers:
         tip = finger_chain(body.description, finger)
-        motion = tip.at(q)
+        motion = tip.evaluate(q)
         kinematics = actuated(body.description, q)
         frame = kinematics.kinematics.contact_frame(finger)
         point = dq.translation(motion.pose)
@@ -129,7 +129,7 @@ def test_eq_12_is_the_display_of_the_paper(toy, rng):
     q = ca.SX.sym("q", len(toy.actuators))
     tip = finger_chain(toy.description, "left")
     assert tip.drivers == ("left_spread", "left_1", "left_2")
-    motion = tip.at(q)
+    motion = tip.evaluate(q)
     bar = mechanisms.Linkage(0.0297, 0.0347, 0.0084, 0.0072, -1)
     f = mechanisms.theta3_rate(3.32939008 + motion.joints["left_2"], bar)
     s = motion.screws.jacobian  # left_spread, left_1, left_2, left_3, left_4
@@ -144,7 +144,7 @@ def test_eqs_8_10_rates_are_those_of_the_couplings(toy, rng):
     q = ca.SX.sym("q", len(toy.actuators))
     body = actuated(toy.description, q)
     for finger in toy.fingers:
-        motion = finger_chain(toy.description, finger).at(q)
+        motion = finger_chain(toy.description, finger).evaluate(q)
         tip = motion.tip
         rates = ca.vertcat(*(motion._rate(name) for name in tip.drivers))
         assert np.array(ca.evalf(ca.densify(rates))).ravel() == pytest.approx(1)
@@ -165,8 +165,8 @@ def test_eqs_15_16_relative_jacobian(toy, robot, rng):
     ):
         q = ca.SX.sym("q", len(body.actuators))
         tip = relative_chain(body.description, reference, finger)
-        motion = tip.at(q)
-        a, b = (finger_chain(body.description, name).at(q) for name in (reference, finger))
+        motion = tip.evaluate(q)
+        a, b = (finger_chain(body.description, name).evaluate(q) for name in (reference, finger))
         pose = dq.multiply(dq.conjugate(a.pose), b.pose)
         columns = []
         for index in tip.actuators:
@@ -199,7 +199,7 @@ def test_eqs_15_16_signs_and_columns(toy):
         *("thumb_turn", "thumb_slide", "thumb_bend"),
     )
     assert tip.drivers == ("left_2", "left_1", "left_spread", *tip.chain.joints[5:])
-    motion = tip.at(ca.SX.sym("q", len(toy.actuators)))
+    motion = tip.evaluate(ca.SX.sym("q", len(toy.actuators)))
     assert motion.joint_jacobian.shape == (6, 6)
     signed = np.array(motion.displacement(ca.DM.ones(6, 1))).ravel()
     np.testing.assert_array_equal(signed, [-1, -1, -1, 1, 1, 1])

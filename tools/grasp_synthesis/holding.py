@@ -55,7 +55,7 @@ def hold(
     for i, column in enumerate(columns):
         q[column] = arm[i]
     links = actuated(robot, q).kinematics.links
-    item = links[root].at(pinch.object_in_hand)
+    item = links[root].compose(pinch.object_in_hand)
     wished = rng.uniform(scene.low, scene.high)
     equal = ca.SX(0, 1)
     rows = [item.origin - scene.low, scene.high - item.origin]

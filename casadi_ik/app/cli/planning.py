@@ -140,7 +140,7 @@ def grasps_npz(grasps: FoundGrasps, fingers: tuple[str, ...]) -> bytes:
         for name, contact in entry.grasp.contacts.items():
             arrays["points"][row, fingers.index(name)] = contact.point
             arrays["normals"][row, fingers.index(name)] = contact.normal
-        for name, vectors in entry.grasp.more(fingers).items():
+        for name, vectors in entry.grasp.extra_vectors(fingers).items():
             arrays.setdefault(name, np.full((k, f, 3), np.nan))[row] = vectors
     choices = [
         Choice(i, entry.solution, entry.score, entry.grasp) for i, entry in enumerate(grasps)

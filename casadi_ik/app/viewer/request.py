@@ -71,7 +71,7 @@ class DraggableContact:
     @cached_property
     def in_base(self) -> Contact:
         """Contact in the base frame, without its normal unless that is constrained."""
-        contact = self.contact.at(self.control)
+        contact = self.contact.transformed(self.control)
         if self.uses_normal or not np.isfinite(contact.point).all():
             return contact
         poses = {name: getattr(contact, name) for name in POINT_CONSTRAINTS}
@@ -192,10 +192,12 @@ def request_of(
         ):
             # The normal is stored so that it can be switched on later.
             full_contact = Contact(position, normal, contact.tolerance)
-            local = full_contact.at(inverse(control))
+            local = full_contact.transformed(inverse(control))
             contacts[finger] = DraggableContact(local, control, is_used, uses_normal=False)
         else:
-            contacts[finger] = DraggableContact(contact.at(inverse(control)), control, is_used)
+            contacts[finger] = DraggableContact(
+                contact.transformed(inverse(control)), control, is_used
+            )
     request = PageRequest(contacts, robot=robot.name, scene=scene, settings=settings or Settings())
     if grasp is None:
         return request

@@ -90,7 +90,7 @@ def _joint_position(tree: RobotTree, name: str, positions: Mapping[str, float]) 
         return positions[name]
     if joint.coupling is not None and joint.coupling.of in tree.by_name:
         leader = _joint_position(tree, joint.coupling.of, positions)
-        return float(joint.coupling.followed(np.array([leader]))[0])
+        return float(joint.coupling.joint_position(np.array([leader]))[0])
     if joint.limits is not None and joint.limits[0] == joint.limits[1]:
         return joint.limits[0]
     return 0.0

@@ -158,7 +158,9 @@ def tip(task: ScrewTask, robot: RobotDescription, q: Expr) -> Tip:
     chain = task.chain(robot)
     axis = chain.chain.screws[-1].direction if task.axis is None else np.asarray(task.axis, float)
     normal = robot.finger(task.finger).normal
-    return Tip(chain.at(q), ca.DM(normal.tolist()), ca.DM((axis / np.linalg.norm(axis)).tolist()))
+    return Tip(
+        chain.evaluate(q), ca.DM(normal.tolist()), ca.DM((axis / np.linalg.norm(axis)).tolist())
+    )
 
 
 def _pose(tip: Tip, target: dict[str, Expr]) -> Rows:

@@ -163,7 +163,7 @@ class Surface(RecordReprMixin):
     @property
     def inside(self) -> Bools:
         """Deprecated name of `fits_pad`."""
-        warn_renamed("Surface.inside", "Surface.fits_pad", stacklevel=3)
+        warn_renamed("Surface.inside", "Surface.fits_pad")
         return self.fits_pad
 
     @cached_property

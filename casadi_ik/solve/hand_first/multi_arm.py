@@ -145,7 +145,7 @@ class ArmHandSide:
     def palm(self, kinematics: ActuatedKinematics) -> Pose:
         """Return the pose of its palm, base frame."""
         robot = self.robot
-        return kinematics.kinematics.links[robot.palm_link].at(robot.palm_placement)
+        return kinematics.kinematics.links[robot.palm_link].compose(robot.palm_placement)
 
 
 def arm_hand_sides(robot: RobotDescription, candidates: int, kinds: Kinds) -> list[ArmHandSide]:

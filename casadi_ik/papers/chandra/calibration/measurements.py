@@ -55,7 +55,7 @@ class Measurements:
     @property
     def turned(self) -> NDArray[np.bool_]:
         """Deprecated name of `has_orientation`."""
-        warn_renamed("Measurements.turned", "Measurements.has_orientation", stacklevel=3)
+        warn_renamed("Measurements.turned", "Measurements.has_orientation")
         return self.has_orientation
 
     @property
