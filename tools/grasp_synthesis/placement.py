@@ -62,7 +62,7 @@ def place(
     arm = ca.SX.sym("arm", 7)
     kin = hand.kinematics(arm, ca.SX(pinch.posture))
     palm = kin.links[FRAME_W]
-    pose = palm.at(pinch.object_in_palm)
+    pose = palm.compose(pinch.object_in_palm)
     if recipe.up is None:
         up, height = -palm.rotation[:, 2], -item.mesh(64)[0][:, 2].min()
     else:
