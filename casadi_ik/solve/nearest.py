@@ -92,7 +92,7 @@ def _library_text(is_wide: bool) -> str:
             "#include <stdint.h>\n#include <string.h>\n",
             f"#if defined(_WIN32){export}#endif\n",
             entry,
-            driver_text("loop_job"),
+            driver_text("jobs"),
             search_code(),
         )
     )
