@@ -323,7 +323,8 @@ class NearestSearch:
     def _parameters(self, targets: TargetBatch, max_step: float) -> Array:
         """Return the parameters (k, np) of the descent."""
         contacts = self._step.contacts
-        values = {f"{name}s": np.nan_to_num(targets.vectors(f"{name}s")) for name in contacts.data}
+        vectors = {f"{name}s": targets.vectors(f"{name}s") for name in contacts.data}
+        values = {name: np.where(np.isnan(array), 0.0, array) for name, array in vectors.items()}
         lower, upper = targets.bounds(self._trials.robot.description)
         bounds = {"weights": _weights(targets), "lower": lower, "upper": upper}
         return self._step.parameters.pack_rows(
