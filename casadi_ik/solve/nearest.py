@@ -27,6 +27,7 @@ from casadi_ik.compile.loop import MIN_SOLVES_IN_LANES, NO_LIMIT, SLOTS, UNBEGUN
 from casadi_ik.files.arrays import Array, Rows, spread_points
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.hand_first.search_code import EXPORT
 from casadi_ik.solve.nearest_descent import DESCENT, DescentStep
 from casadi_ik.solve.nearest_seeds import SEED_SETTINGS, SeedSettings, SeedTable
 from casadi_ik.solve.row_selection import smallest_per_owner
@@ -83,14 +84,12 @@ def search_code() -> str:
 
 def _library_text(is_wide: bool) -> str:
     """Return the text of the library of the search."""
-    _, _, exported = driver_text("common").partition("#if defined(_WIN32)")
-    export, _, _ = exported.partition("#endif")
     entry = f"#define NEAREST_SEARCH EXPORT int {SEARCH_SYMBOL}(nearest_search_job *job)\n"
     return "".join(
         (
             WIDE if is_wide else "",
             "#include <stdint.h>\n#include <string.h>\n",
-            f"#if defined(_WIN32){export}#endif\n",
+            EXPORT,
             entry,
             driver_text("jobs"),
             search_code(),
