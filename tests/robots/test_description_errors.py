@@ -167,10 +167,3 @@ def test_duplicate_key(own_robot):
     replace(own_robot, "thumb: thumb", "thumb: thumb\nthumb: finger_2")
     with pytest.raises(ik.errors.DescriptionError, match=r"robot\.yaml:\d+:1: .*key 'thumb'"):
         ik.load_robot(own_robot)
-
-
-def test_unknown_robot_lists_the_shipped():
-    with pytest.raises(ik.errors.UnknownNameError, match=r"'pr2'.*kuka_lwr_barr"):
-        ik.load_robot("pr2")
-    with pytest.raises(ik.errors.DescriptionError, match=r"my/robot\.yaml:"):
-        ik.load_robot("my/robot.yaml")
