@@ -59,8 +59,10 @@ def test_maps_are_written_and_read(reach, tmp_path):
     header, _, vertices = data.partition(b"end_header\n")
     assert f"element vertex {(reach.share > 0).sum()}".encode() in header
     assert len(vertices) == 19 * (reach.share > 0).sum()
-    positions, share = reach.slice("z", 0.4)
+    positions, share = reach.layer_shares("z", 0.4)
     assert positions.shape[:2] == share.shape == reach.shape[:2]
+    with pytest.warns(DeprecationWarning, match="layer_shares"):
+        assert np.array_equal(reach.slice("z", 0.4)[1], share)
     (tmp_path / "text.npz").write_text("no map")
     with pytest.raises(ik.errors.InputError, match=r"text\.npz"):
         ReachMap.load(tmp_path / "text.npz")

@@ -37,7 +37,7 @@ def draw_reach_map(
     axes = figure.subplots(1, 3)
     image = None
     for ax, normal, (horizontal, vertical) in zip(axes, "yxz", ("xz", "yz", "xy"), strict=True):
-        positions, share = reach.slice(normal)
+        positions, share = reach.layer_shares(normal)
         columns, rows = (
             positions[:, 0, "xyz".index(horizontal)],
             positions[0, :, "xyz".index(vertical)],

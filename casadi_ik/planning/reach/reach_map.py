@@ -17,6 +17,7 @@ from casadi_ik.errors import InputError, UnsupportedError, os_errors
 from casadi_ik.files.arrays import Array, spread_points
 from casadi_ik.files.input_checks.poses import checked_pose, checked_rotations
 from casadi_ik.files.progress import progress
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import describe_arm
@@ -93,8 +94,8 @@ class ReachMap:
         """Return the palm poses (m, 4, 4) of a position."""
         return _poses(self.positions, self.rotations, self.shape, slice(position, position + 1))
 
-    def slice(self, axis: str = "z", value: float | None = None) -> tuple[Array, Array]:
-        """Return the layer of the grid nearest to a coordinate.
+    def layer_shares(self, axis: str = "z", value: float | None = None) -> tuple[Array, Array]:
+        """Return positions and shares of the layer of the grid nearest to a coordinate.
 
         Args:
             axis: "x", "y" or "z".
@@ -107,7 +108,7 @@ class ReachMap:
             InputError: The map has no grid, or the axis does not exist.
         """
         if not self.shape:
-            raise InputError("slice: the map has no grid; expected a map of a region")
+            raise InputError("layer_shares: the map has no grid; expected a map of a region")
         if axis not in ("x", "y", "z"):
             raise InputError(f"axis: found {axis!r}, expected x, y or z")
         number = "xyz".index(axis)
@@ -117,6 +118,11 @@ class ReachMap:
         layer = int(np.argmin(np.abs(coordinates - (center if value is None else value))))
         share = self.share.reshape(self.shape)
         return np.take(positions, layer, number), np.take(share, layer, number)
+
+    def slice(self, axis: str = "z", value: float | None = None) -> tuple[Array, Array]:
+        """Return `layer_shares`; deprecated name."""
+        warn_renamed("ReachMap.slice", "ReachMap.layer_shares")
+        return self.layer_shares(axis, value)
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the map as .npz.
