@@ -1,4 +1,4 @@
-"""State of the compiler that tests of kernels reset: loaded libraries, warnings, builds."""
+"""State of compiled code that tests reset: loaded libraries, warnings, builds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all tests share: the shipped robot, a robot with every kind of coupling, an oracle."""
+"""Fixtures of all tests: robots, oracles, a browser."""
 
 from __future__ import annotations
 
@@ -24,59 +24,59 @@ if TYPE_CHECKING:
     from pinocchio_oracle import PinocchioRobot
 
 REFERENCE = re.compile(r"^ *(?:import|from) (?:pinocchio|coal)(?:_oracle)?\b", re.MULTILINE)
-"""A test module that asks other libraries for a second opinion: the extra `reference`."""
+"""Test modules that compare with other libraries (extra `reference`)."""
 
 # Half the time of the tests was the compiler's. Without optimisation it takes 0.4 of that, and not
 # a bit of a result is another (`test_optimisation_changes_no_bit`, of kernels and of hand-first).
 # What solves much takes the usual flags: `usual_flags`.
 os.environ.setdefault("CASADI_IK_CFLAGS", "-O0")
-# Every answer from compiled code, of the first solve too.
+# Every answer is from compiled code, also that of the first solve.
 os.environ.setdefault("CASADI_IK_COMPILE", "wait")
 
-# How long an example takes says nothing on a busy machine.
+# Durations of examples have no meaning on a busy machine.
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    """Leave out modules that compare with pinocchio and coal where these are not installed."""
+    """Ignore modules that compare with pinocchio and coal where these are not installed."""
     if collection_path.suffix != ".py" or find_spec("pinocchio") is not None:
         return None
     return True if REFERENCE.search(collection_path.read_text(encoding="utf-8")) else None
 
 
 def pytest_report_header() -> str:
-    """Say what is left out."""
+    """Report the comparisons that are left out."""
     return "" if find_spec("pinocchio") else "no pinocchio: comparisons with it are left out"
 
 
 @pytest.fixture(scope="session")
 def robot() -> ik.ArmHand:
-    """The shipped KUKA LWR 4+ with the Barrett hand."""
+    """Shipped KUKA LWR 4+ with the Barrett hand."""
     return ik.load_robot("kuka_lwr_barrett")
 
 
 @pytest.fixture(scope="session")
 def solver(robot: ik.ArmHand) -> ik.Solver:
-    """Hand-first on it, as it comes."""
+    """Hand-first solver with default options."""
     return ik.Solver(robot)
 
 
 @pytest.fixture(scope="session")
 def ar10() -> ik.ArmHand:
-    """The shipped AR10 hand: ten sliders, no arm."""
+    """Shipped AR10 hand: ten sliders, no arm."""
     return ik.load_robot("ar10")
 
 
 @pytest.fixture(scope="session")
 def coupled_robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
-    """A small robot in which every kind of coupling and joint occurs."""
+    """Small robot with every kind of coupling and joint."""
     return ik.load_robot(write_coupled_robot(tmp_path_factory.mktemp("coupled")))
 
 
 @pytest.fixture(scope="session")
 def oracle(robot: ik.ArmHand) -> PinocchioRobot:
-    """The shipped robot as pinocchio reads it from the written URDF."""
+    """Shipped robot in pinocchio, from the written URDF."""
     pytest.importorskip("pinocchio")
     from pinocchio_oracle import PinocchioRobot
 
@@ -85,7 +85,7 @@ def oracle(robot: ik.ArmHand) -> PinocchioRobot:
 
 @pytest.fixture(scope="session")
 def coupled_oracle(coupled_robot: ik.ArmHand) -> PinocchioRobot:
-    """The coupled robot as pinocchio reads it from the written URDF."""
+    """Coupled robot in pinocchio, from the written URDF."""
     pytest.importorskip("pinocchio")
     from pinocchio_oracle import PinocchioRobot
 
@@ -94,7 +94,7 @@ def coupled_oracle(coupled_robot: ik.ArmHand) -> PinocchioRobot:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    """One Chromium for all tests of a process; tests are skipped without it."""
+    """Chromium for all tests of a process; tests are skipped without it."""
     if CHROMIUM is None:
         pytest.skip("no Chromium (on Debian: apt-get install chromium)")
     with Browser() as started:
@@ -118,7 +118,7 @@ def view() -> Iterator[Callable[..., Any]]:
 
 @pytest.fixture(scope="module")
 def usual_flags() -> Iterator[None]:
-    """Kernels as users have them, for tests that solve so much that it pays."""
+    """Set the compiler flags of users, for tests with many solves."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("CASADI_IK_CFLAGS", raising=False)
         yield
@@ -126,18 +126,18 @@ def usual_flags() -> Iterator[None]:
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """Random numbers, the same in every run."""
+    """Random numbers that are the same in every run."""
     return np.random.default_rng(20211121)
 
 
 @pytest.fixture
 def own_robot(tmp_path: Path) -> Path:
-    """A copy of the shipped descriptions, for tests that break them."""
+    """Copy of the shipped descriptions that tests may change."""
     return copy_shipped_robot(tmp_path)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Without OpenGL nothing can be drawn; CI has it, and there the tests must run."""
+    """Skip tests that draw where OpenGL is missing, except in CI."""
     drawing = [item for item in items if item.get_closest_marker("opengl")]
     if drawing and "CI" not in os.environ and not _has_opengl():
         for item in drawing:
@@ -145,6 +145,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _has_opengl() -> bool:
-    """Tried in a process of its own, since VTK may end it."""
+    """Return whether OpenGL works, tested in another process because VTK may abort it."""
     program = "from casadi_ik.app.pictures.scene3d import Stage; Stage().close()"
     return subprocess.run([sys.executable, "-c", program], capture_output=True).returncode == 0

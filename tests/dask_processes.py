@@ -1,4 +1,4 @@
-"""Scheduler and workers of Dask as processes, the way its documentation starts them."""
+"""Scheduler and workers of Dask as processes, started like in its documentation."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ WORKER = ("--nthreads", "1", "--no-dashboard", "--no-nanny")
 
 @contextmanager
 def dask_process(*words: str, says: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A process of Dask's command line, from when it has said something; gives the line too.
+    """Start a process of Dask's command line, and return it with the line that reports its start.
 
-    It runs elsewhere and knows the installed package only.
+    It runs in another folder and imports the installed package only.
     """
     process = subprocess.Popen(
         [sys.executable, "-m", "dask", *words],
@@ -32,7 +32,7 @@ def dask_process(*words: str, says: str) -> Iterator[tuple[subprocess.Popen[str]
     assert process.stdout is not None
     try:
         yield process, next(line for line in process.stdout if says in line)
-        # What it says meanwhile may be as much as a pipe holds.
+        # Later output must not fill the pipe.
     finally:
         process.terminate()
         process.communicate(timeout=180)
@@ -40,13 +40,13 @@ def dask_process(*words: str, says: str) -> Iterator[tuple[subprocess.Popen[str]
 
 @contextmanager
 def scheduler_process() -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A scheduler without workers and its address."""
+    """Start a scheduler without workers, and return its address."""
     with dask_process(*SCHEDULER, says="Scheduler at:") as (process, line):
         yield process, line.split()[-1]
 
 
 @contextmanager
 def worker_process(address: str) -> Iterator[subprocess.Popen[str]]:
-    """A worker of one thread that a scheduler knows already."""
+    """Start a worker of one thread, and wait until the scheduler knows it."""
     with dask_process("worker", address, *WORKER, says="Registered to:") as (process, _):
         yield process

@@ -1,4 +1,4 @@
-"""Small files of robots as other people write them, one obstacle each."""
+"""Small robot files in other formats, with one obstacle each."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def urdf(path: Path, *parts: str) -> Path:
 
 
 def hand(folder: Path, *changes: tuple[str, str], name: str = "hand.urdf") -> Path:
-    """A hand of two fingers with three joints each, the last one following; with changes."""
+    """Write a hand of two fingers with three joints each, the last one coupled; with changes."""
     text = link("base_link", *(f"{s}_{n}" for s in ("left", "right") for n in ("1", "2", "tip")))
     for side, place, turn in (("left", "0 0.04 0.05", "0.1"), ("right", "0 -0.04 0.05", "3.2")):
         rpy = f"0.05 0 {turn}"
@@ -56,7 +56,7 @@ def hand(folder: Path, *changes: tuple[str, str], name: str = "hand.urdf") -> Pa
 
 
 def arm(folder: Path, joints: int = 6, name: str = "arm.urdf") -> Path:
-    """An arm of some joints on alternating axes; its first link is called base_link as well."""
+    """Write an arm of some joints on alternating axes, whose first link is base_link as well."""
     links = ["base_link", *(f"arm_{i}" for i in range(1, joints + 1)), "flange"]
     text = link(*links)
     for i in range(joints):

@@ -1,4 +1,4 @@
-"""A person's hand that moves, as 21 keypoints: made up, of a person's size."""
+"""Made-up hand of a person that moves, as 21 keypoints of realistic size."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 import casadi_ik as ik
 
 BONES = (0.045, 0.027, 0.022)
-"""Of a finger behind its knuckle [m]."""
+"""Lengths of the bones of a finger behind its knuckle [m]."""
 
 
 def hand(bend: float, wrist: np.ndarray, turn: float = 0.0) -> np.ndarray:

@@ -1,6 +1,6 @@
-"""Forward kinematics and limits in numpy alone, many configurations at once.
+"""Forward kinematics and limits in numpy alone, for many configurations at once.
 
-Nothing of the package's own arithmetic is used: only the numbers of the description.
+It uses only the numbers of the description, and none of the package's arithmetic.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from casadi_ik.model.couplings import FourBar, LeadScrew
 
 
 def joint_positions(robot: ik.ArmHand, q: np.ndarray) -> dict[str, np.ndarray]:
-    """Positions (k,) of actuators and movable joints by name."""
+    """Return the positions (k,) of actuators and movable joints by name."""
     values = dict(zip(robot.actuators, q.T, strict=True))
     joints = {joint.name: joint for joint in robot.description.movable}
 
@@ -37,7 +37,7 @@ def _coupled(coupling, x: np.ndarray) -> np.ndarray:
 
 
 def _four_bar(bar: FourBar, phi: np.ndarray) -> np.ndarray:
-    """Coupler angle by intersecting two circles, of both the one like the known pose."""
+    """Return the coupler angle by intersecting circles, on the branch of the known pose."""
     pin = bar.p * np.exp(1j * phi)
     line = bar.g - pin
     crank_fraction = (np.abs(line) ** 2 + bar.h**2 - bar.q**2) / (2 * np.abs(line))
@@ -53,7 +53,7 @@ def _four_bar(bar: FourBar, phi: np.ndarray) -> np.ndarray:
 
 
 def contacts(robot: ik.ArmHand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals as `ArmHand.contacts`."""
+    """Return points and normals like `ArmHand.contacts`."""
     poses = links(robot, joint_positions(robot, q))
     points, normals = [], []
     for finger in robot.description.fingers:
@@ -64,7 +64,7 @@ def contacts(robot: ik.ArmHand, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def links(robot: ik.ArmHand, values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Poses (k, 4, 4) of links by name, of all joints' positions (k,), whatever couples them."""
+    """Return the poses (k, 4, 4) of links by name, from positions (k,) of all joints."""
     count = len(next(iter(values.values()), [0]))
     poses = {robot.description.root: np.tile(np.eye(4), (count, 1, 1))}
     for joint in robot.description.joints:
@@ -80,7 +80,7 @@ def links(robot: ik.ArmHand, values: dict[str, np.ndarray]) -> dict[str, np.ndar
 
 
 def _rotation_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula."""
+    """Return rotations by Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     pose = np.tile(np.eye(4), (len(angle), 1, 1))
@@ -90,7 +90,7 @@ def _rotation_about(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def beyond_limits(robot: ik.ArmHand, q: np.ndarray) -> np.ndarray:
-    """(k,) by how much the worst actuator or joint is beyond what its file allows."""
+    """Return by how much the worst actuator or joint exceeds its limits (k,)."""
     values = joint_positions(robot, q)
     limited = [*robot.description.actuators, *robot.description.movable]
     return np.max(

@@ -1,4 +1,4 @@
-"""The independent oracle: pinocchio on the URDF that a robot writes of itself."""
+"""Independent oracle: pinocchio with the URDF that a robot writes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import casadi_ik as ik
 
 
 class PinocchioRobot:
-    """A robot in pinocchio; every joint is free, whatever it is coupled to."""
+    """Robot in pinocchio, in which every joint is independent."""
 
     def __init__(self, robot: ik.ArmHand) -> None:
         self.robot = robot
@@ -17,14 +17,14 @@ class PinocchioRobot:
         self.data = self.model.createData()
 
     def configuration(self, q) -> np.ndarray:
-        """Pinocchio's own vector for our actuators."""
+        """Return the configuration in pinocchio of actuator positions."""
         values = np.zeros(self.model.nq)
         for name, value in self.robot.joints(q).items():
             values[self.model.joints[self.model.getJointId(name)].idx_q] = value
         return values
 
     def frames(self, q) -> dict[str, np.ndarray]:
-        """Pose (4, 4) of every link, the contact links included."""
+        """Return the pose (4, 4) of every link, including contact links."""
         pin.framesForwardKinematics(self.model, self.data, self.configuration(q))
         return {
             frame.name: self.data.oMf[i].homogeneous
@@ -33,7 +33,7 @@ class PinocchioRobot:
         }
 
     def contacts(self, q) -> tuple[np.ndarray, np.ndarray]:
-        """Points and normals as `ArmHand.contacts`."""
+        """Return points and normals like `ArmHand.contacts`."""
         frames = self.frames(q)
         fingers = self.robot.description.fingers
         poses = [frames[f"{finger.name}_contact"] for finger in fingers]
@@ -44,7 +44,7 @@ class PinocchioRobot:
         return points, np.array(normals)
 
     def jacobian(self, q, frame: str, reference: pin.ReferenceFrame) -> np.ndarray:
-        """(6, m) twist [v; w] of a frame per movable joint, in our order of joints."""
+        """Return the twist (6, m) [v; w] of a frame per movable joint of the description."""
         pin.computeJointJacobians(self.model, self.data, self.configuration(q))
         pin.updateFramePlacements(self.model, self.data)
         frame_jacobian = pin.getFrameJacobian(
@@ -55,7 +55,7 @@ class PinocchioRobot:
 
 
 def verdict(oracle: PinocchioRobot, q, points, normals) -> tuple[np.ndarray, np.ndarray]:
-    """Distances [m] and angles [rad] of one configuration from (f, 3) targets."""
+    """Return distances [m] and angles [rad] of a configuration from targets (f, 3)."""
     p, n = oracle.contacts(q)
     cosine = np.einsum("ij,ij->i", n, normals)
     sine = np.linalg.norm(np.cross(n, normals), axis=1)
@@ -63,7 +63,7 @@ def verdict(oracle: PinocchioRobot, q, points, normals) -> tuple[np.ndarray, np.
 
 
 def assert_verdicts(oracle: PinocchioRobot, batch, points, normals, enforce: bool = True) -> None:
-    """Errors, limits and success of every row of a batch, recomputed from q alone."""
+    """Assert errors, limits and success of every row of a batch, recomputed from q alone."""
     robot, model = oracle.robot, oracle.model
     usual = ik.Tolerance()
     for row, q in enumerate(batch.q):

@@ -1,4 +1,4 @@
-"""Python in processes of its own."""
+"""Processes of Python and of other programs, and limits of resources."""
 
 from __future__ import annotations
 

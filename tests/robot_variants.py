@@ -1,4 +1,4 @@
-"""Robots derived from the shipped one: other links, other mounts, an elbow off the links."""
+"""Robots derived from the shipped one: other links, other mounts, an offset elbow."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def derived_robot(
 
 
 def part_of_the_arm(folder: Path, joints: slice) -> Path:
-    """The file of the shipped hand on some joints of the shipped arm, one after the other."""
+    """Write the shipped hand on some joints of the shipped arm in series."""
     path = copy_shipped_robot(folder)
     with edited(folder / "arm.yaml") as arm:
         arm["joints"] = arm["joints"][joints]
@@ -99,14 +99,14 @@ def thumb_of(folder: Path, joints: int) -> ik.ArmHand:
 
 
 def _revolute(name: str, parent: str, child: str, axis: list[int], origin: dict) -> dict:
-    """A joint of plus and minus 40 deg."""
+    """Return a joint with limits of plus and minus 40 deg."""
     limits = ["-40 deg", "40 deg"]
     entry = {"name": name, "parent": parent, "child": child, "axis": axis, "origin": origin}
     return entry | {"limits": limits, "source": "assumed", "velocity": "2 rad/s"}
 
 
 def with_fixed_motor(robot: ik.ArmHand, motor: str) -> ik.ArmHand:
-    """A robot in which the joint of a motor is fixed at zero."""
+    """Return a robot in which the joint of a motor is fixed at zero."""
     body = robot.description
     assert motor in body.actuator_names
     moving = [i for i, actuator in enumerate(body.actuators) if actuator.name != motor]

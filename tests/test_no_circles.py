@@ -1,4 +1,4 @@
-"""No module of the package imports, directly or not, a module that imports it."""
+"""No module of the package imports, directly or indirectly, a module that imports it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Progress where `sys.stderr` is not a terminal's stream."""
+"""Progress output where `sys.stderr` is not the stream of a terminal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from casadi_ik.compile.compiler import print_note
 
 
 class LogStream:
-    """A program's own stream, which has nothing but `write`."""
+    """Stream of a program with `write` only."""
 
     def __init__(self) -> None:
         self.text = ""
@@ -23,7 +23,7 @@ class LogStream:
 
 
 class ClosedTerminal(LogStream):
-    """A stream that was closed; asking it anything is an error."""
+    """Closed stream, of which every use is an error."""
 
     closed = True
 

@@ -1,4 +1,4 @@
-"""Every public result can be pickled, copied and deep-copied, and means the same afterwards."""
+"""Every public result can be pickled, copied and deep-copied without loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small robots as files: one with every coupling, and the shipped one to be broken."""
+"""Small robots as files, copies of the shipped one, and grasps of configurations."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ fingers:
   right: {link: right_a, xyz: [0, 0, 0.03], normal: [1, 0, 0], source: toy}
   thumb: {link: thumb_2, xyz: [0, 0.01, 0.02], rpy: [1, 0, 0], normal: [0, 0, -2], source: toy}
 """
-"""A spread motor for two fingers, sliders, a four-bar, chains of followers, a prismatic thumb."""
+"""Hand with a shared spread motor, sliders, a four-bar, followers, a prismatic thumb."""
 
 COUPLED_ROBOT = """\
 name: coupled robot-1
@@ -82,7 +82,7 @@ MULTI_ARM_ROBOTS = ("g1+dex3", "two_pandas+allegro", "two_ur10e+leap", "mobile_k
 
 
 def write_coupled_robot(folder: Path) -> Path:
-    """Write the coupled robot, its hand in a folder beside it; the path of the robot's file."""
+    """Write the coupled robot, its hand in a folder beside it; return the path of its file."""
     (folder / "parts").mkdir()
     (folder / "parts" / "hand.yaml").write_text(COUPLED_HAND)
     path = folder / "robot.yaml"
@@ -91,7 +91,7 @@ def write_coupled_robot(folder: Path) -> Path:
 
 
 def copy_shipped_robot(folder: Path) -> Path:
-    """Copies of the shipped robot, arm and hand as robot.yaml, arm.yaml, hand.yaml."""
+    """Copy the shipped robot, arm and hand as robot.yaml, arm.yaml, hand.yaml; return the first."""
     shutil.copy(MODELS / "arms" / "kuka_lwr4.yaml", folder / "arm.yaml")
     shutil.copy(MODELS / "hands" / "barrett_bh8_280.yaml", folder / "hand.yaml")
     text = (MODELS / "arm_hands" / "kuka_lwr_barrett.yaml").read_text()
@@ -105,7 +105,7 @@ def copy_shipped_robot(folder: Path) -> Path:
 
 
 def replace(path: Path, old: str, new: str) -> None:
-    """Replace the first occurrence of some text in a file; it has to be there."""
+    """Replace the first occurrence of a text in a file, which must exist."""
     text = path.read_text()
     assert old in text, f"{path} has no {old!r}"
     path.write_text(text.replace(old, new, 1))
@@ -120,30 +120,30 @@ def edited(path: Path) -> Iterator[Any]:
 
 
 def near_home(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> np.ndarray:
-    """(count, n) configurations that every method has a fair chance to find from home."""
+    """Return (count, n) configurations that every method can solve from home."""
     reach = 0.05 * (robot.upper - robot.lower)
     q = robot.home + rng.uniform(-1, 1, (count, len(reach))) * reach
     return np.clip(q, robot.lower, robot.upper)
 
 
 def grasp_of(robot: ik.ArmHand, points: np.ndarray, normals: np.ndarray) -> ik.Grasp:
-    """A contact for every finger, from arrays (f, 3)."""
+    """Return a grasp with a contact for every finger, from arrays (f, 3)."""
     contacts = map(ik.Contact, points, normals)
     return ik.Grasp(dict(zip(robot.fingers, contacts, strict=True)))
 
 
 def grasp_at(robot: ik.ArmHand, q: np.ndarray) -> ik.Grasp:
-    """The contacts of a configuration."""
+    """Return the grasp of the contacts of a configuration."""
     return grasp_of(robot, *robot.contacts(q))
 
 
 def grasps_of(robot: ik.ArmHand, points: np.ndarray, normals: np.ndarray) -> list[ik.Grasp]:
-    """The same of arrays (k, f, 3)."""
+    """Return the grasps of arrays (k, f, 3)."""
     return [grasp_of(robot, *pair) for pair in zip(points, normals, strict=True)]
 
 
 def moved_targets(targets, rng, metres, angle):
-    """Contacts (k, f, 3) moved and their normals turned by so much, any way."""
+    """Return contacts (k, f, 3) displaced by these amounts in random directions."""
     points, normals = targets
     shift, turn = rng.normal(size=points.shape), rng.normal(size=normals.shape)
     points = points + metres * shift / np.linalg.norm(shift, axis=2, keepdims=True)

@@ -1,7 +1,6 @@
-"""What a trace has to agree with: everything in it that can be had in another way is had so.
+"""Checks of traces against independent computations.
 
-Each check needs nothing of the method but what its standard fields promise; where methods differ
-in what a row tells (`Promise`), that is said here.
+The checks use only the promises of standard fields; differences between methods are in `Promise`.
 """
 
 from __future__ import annotations
@@ -32,11 +31,11 @@ from casadi_ik.solve.trace import (
 )
 
 LENGTH = 0.1
-"""Position errors weigh in a cost by this [m]."""
+"""Length by which position errors are divided in a cost [m]."""
 
 
 class TraceRecorder:
-    """A recorder that keeps the blocks in memory."""
+    """Recorder that keeps the blocks in memory."""
 
     def __init__(self) -> None:
         self.blocks: list[SolveBlock] = []
@@ -59,17 +58,17 @@ class Promise:
     """Promises of a method about the rows of its trace.
 
     Attributes:
-        whole: Phases whose errors are those of the row's q (elsewhere the palm is not the arm's).
-        step: Phases whose `STEP_SIZE` is that of the step between two rows in them.
-        before: Whether a row's q is the one the step starts from, otherwise where it led.
-        slack: How near a limit counts as on it [rad or m].
-        thumb_weight: Of the thumb's squares in the cost.
-        normals: How the angle counts in the cost: its "chord" or itself, "angle".
+        exact_phases: Phases whose errors are those of the row's q.
+        step_phases: Phases whose `STEP_SIZE` is that of the step between two rows in them.
+        has_q_before_step: Whether a row's q is the one before its step, not the one after it.
+        slack: Distance from a limit that counts as on it [rad or m].
+        thumb_weight: Weight of the squared errors of the thumb in the cost.
+        normals: Term of the normals in the cost: the "chord" of the angle or the "angle".
     """
 
-    whole: tuple[Phase, ...]
-    step: tuple[Phase, ...]
-    before: bool = True
+    exact_phases: tuple[Phase, ...]
+    step_phases: tuple[Phase, ...]
+    has_q_before_step: bool = True
     slack: float = 0.0
     thumb_weight: float = 1.0
     normals: str = "chord"
@@ -82,7 +81,7 @@ PROMISES = {
     "thumb-first": Promise(
         (Phase.CANDIDATE, Phase.HAND_ALIGNMENT),
         (Phase.HAND_ALIGNMENT,),
-        before=False,
+        has_q_before_step=False,
         thumb_weight=4.0,
         normals="angle",
     ),
@@ -95,10 +94,10 @@ PROMISES = {
 
 
 def check_trace(robot: ik.ArmHand, block: SolveBlock) -> None:
-    """All checks on the trace of a block.
+    """Check the trace of a block.
 
     Raises:
-        AssertionError: Something in it does not agree with the rest.
+        AssertionError: A value of the trace is wrong.
     """
     promise, names = PROMISES[block.method], block.format.layout.names
     _check_errors(robot, block, promise)
@@ -131,8 +130,8 @@ def _in(block: SolveBlock, phases: tuple[Phase, ...]) -> NDArray[np.bool_]:
 
 
 def _check_errors(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> None:
-    """Distances and angles are those of the row's q."""
-    in_promise = _in(block, promise.whole)
+    """Check that distances and angles are those of the row's q."""
+    in_promise = _in(block, promise.exact_phases)
     assert in_promise.any()
     rows, of_solve = block.rows[in_promise], _of_solve(block)[in_promise]
     points, normals = robot.contacts(rows[Q.name].astype(float))
@@ -145,7 +144,7 @@ def _check_errors(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> Non
 
 
 def _pairs(block: SolveBlock, phases: tuple[Phase, ...]) -> NDArray[np.intp]:
-    """Rows whose next one is of the same solve, phase and start, in one of the phases."""
+    """Return the rows whose successor has the same solve, phase and start."""
     of_solve, phase = _of_solve(block), block.rows[PHASE.name]
     same_phase = (
         (of_solve[1:] == of_solve[:-1]) & (phase[1:] == phase[:-1]) & _in(block, phases)[1:]
@@ -157,10 +156,10 @@ def _pairs(block: SolveBlock, phases: tuple[Phase, ...]) -> NDArray[np.intp]:
 
 
 def _check_step(block: SolveBlock, promise: Promise) -> None:
-    """A step taken is as long as the way between two rows."""
-    pairs = _pairs(block, promise.step)
+    """Check that the length of an accepted step is the distance between two rows."""
+    pairs = _pairs(block, promise.step_phases)
     assert len(pairs)
-    step_rows = pairs if promise.before else pairs + 1
+    step_rows = pairs if promise.has_q_before_step else pairs + 1
     max_steps = np.abs(block.rows[Q.name][pairs + 1] - block.rows[Q.name][pairs]).max(axis=1)
     size = block.rows[STEP_SIZE.name][step_rows]
     is_checked = np.ones(len(pairs), dtype=bool)
@@ -171,7 +170,7 @@ def _check_step(block: SolveBlock, promise: Promise) -> None:
 
 
 def _check_limits(robot: ik.ArmHand, block: SolveBlock, promise: Promise) -> None:
-    """The bits of the actuators at or beyond a limit, and of no other."""
+    """Check the bits of the actuators at or beyond a limit."""
     q = block.rows[Q.name]
     at = (q <= robot.lower + promise.slack) | (q >= robot.upper - promise.slack)
     assert at.any()
@@ -193,7 +192,7 @@ def _check_phases(block: SolveBlock) -> None:
 
 
 def _check_status(block: SolveBlock) -> None:
-    """The last row says how it ended; no row before says that it was solved."""
+    """Check that the last row has the final status, and that no earlier row is solved."""
     status_rows = 0
     for row, rows in _solves(block):
         ended = Status(int(block.batch.status[row]))
@@ -205,29 +204,29 @@ def _check_status(block: SolveBlock) -> None:
 
 
 def _check_cost(block: SolveBlock, promise: Promise) -> None:
-    """The squares of all contacts, by the errors of the row; while the hand is fitted no less."""
+    """Check that the cost is the sum of squares, or larger while the hand is fitted."""
     position, angle = block.rows[POSITION_ERROR.name], block.rows[ANGLE_ERROR.name]
     is_known = ~np.isnan(position).any(axis=1)
     assert is_known.any()
-    # Where errors are measured, the cost is, and the other way round.
+    # The cost is recorded exactly where errors are measured.
     np.testing.assert_array_equal(np.isnan(block.rows[COST.name]), ~is_known)
     normal_error = angle if promise.normals == "angle" else 2 * np.sin(angle / 2)
     squares = (position / LENGTH) ** 2 + normal_error**2
     squares[:, block.fingers.index("thumb")] *= promise.thumb_weight
     cost, square_sum = block.rows[COST.name], squares.sum(axis=1)
-    in_promise = is_known & _in(block, promise.whole)
+    in_promise = is_known & _in(block, promise.exact_phases)
     np.testing.assert_allclose(cost[in_promise], square_sum[in_promise], rtol=1e-3, atol=1e-12)
-    # The fit of a hand also counts how far the palm is out of the arm's reach.
+    # The fit of a hand also includes the distance of the palm from the reach of the arm.
     assert (cost[is_known] >= (1 - 1e-3) * square_sum[is_known] - 1e-12).all()
 
 
 def _check_restarts(block: SolveBlock) -> None:
-    """Counted on from 0, one by one, as many as the solve counts."""
+    """Check that restarts are numbered from 0 by one, up to the number of the solve."""
     assert block.batch.restarts.any()
     for row, rows in _solves(block):
         steps = np.diff(rows[RESTART.name].astype(int), prepend=0)
         assert np.isin(steps, (0, 1)).all(), row
-        # A solve that ends in vain says so in a row beyond its last start.
+        # A failed solve has a row beyond its last start.
         final_row = int(rows[STATUS.name][-1] == Status.STALLED)
         assert (
             block.batch.restarts[row]
@@ -237,9 +236,9 @@ def _check_restarts(block: SolveBlock) -> None:
 
 
 def _check_accepted(block: SolveBlock, promise: Promise) -> None:
-    """A step that is taken moves the robot, lowers the cost and eases the damping."""
-    pairs = _pairs(block, promise.step)
-    step_rows = pairs if promise.before else pairs + 1
+    """Check that an accepted step moves the robot, reduces the cost and the damping."""
+    pairs = _pairs(block, promise.step_phases)
+    step_rows = pairs if promise.has_q_before_step else pairs + 1
     is_accepted = block.rows[ACCEPTED.name][step_rows] > 0
     assert is_accepted.any()
     assert not is_accepted.all()
@@ -250,7 +249,7 @@ def _check_accepted(block: SolveBlock, promise: Promise) -> None:
     damping = block.rows[DAMPING.name]
     assert (
         damping[pairs[~is_accepted] + 1] > damping[pairs[~is_accepted]]
-    ).all() or not promise.before
+    ).all() or not promise.has_q_before_step
     assert (damping[step_rows] > 0).all()
 
 
@@ -259,11 +258,11 @@ def _check_active(block: SolveBlock) -> None:
     n = block.rows[Q.name].shape[1]
     at = _bits(block.rows[LIMIT_MASK.name], n)
     is_active = _bits(block.rows[ACTIVE_MASK.name], n)
-    pairs = _pairs(block, PROMISES[block.method].step)
+    pairs = _pairs(block, PROMISES[block.method].step_phases)
     come = at[pairs + 1] & ~at[pairs]
     assert come.any()
     assert is_active[pairs + 1][come].all()
-    # And it holds nothing that it leaves.
+    # A joint that leaves a limit is not active.
     is_accepted = block.rows[ACCEPTED.name][pairs + 1] > 0
     released = at[pairs] & ~at[pairs + 1]
     assert not is_active[pairs + 1][is_accepted][released[is_accepted]].any()

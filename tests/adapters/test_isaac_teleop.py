@@ -1,4 +1,4 @@
-"""The retargeter in a pipeline of Isaac Teleop; runs where `isaacteleop` is installed."""
+"""The retargeter in a pipeline of Isaac Teleop, where `isaacteleop` is installed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RESET = ComputeContext(execution_events=ExecutionEvents(reset=True))
 
 
 def tracked(positions: np.ndarray | None) -> OptionalTensorGroup:
-    """26 joints of OpenXR (26, 3) [m]; None: the hand is not seen."""
+    """Return 26 joints of OpenXR (26, 3) [m]; None means that the hand is not seen."""
     group = OptionalTensorGroup(HandInput())
     if positions is not None:
         group[HandInputIndex.JOINT_POSITIONS] = positions.astype(np.float32)

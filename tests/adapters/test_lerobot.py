@@ -1,4 +1,4 @@
-"""Steps of LeRobot with our kinematics; runs where `lerobot` is installed."""
+"""Tests of the processing steps of LeRobot; they run where `lerobot` is installed."""
 
 from __future__ import annotations
 

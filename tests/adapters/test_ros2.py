@@ -1,4 +1,4 @@
-"""Contacts to joint states between two processes; runs where eclipse-zenoh is installed."""
+"""Contacts to joint states between two processes, where eclipse-zenoh is installed."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_messages_match_ros_serialisation(rng):
 
 @pytest.mark.slow
 def test_service_answers_another_process(node, rng):
-    """Prints the median of the round trips (`pytest -s`), the decoding of the answer included."""
+    """Print the median of the round trips (`pytest -s`), which includes decoding the answer."""
     config = zenoh.Config()
     config.insert_json5("connect/endpoints", f'["tcp/127.0.0.1:{node}"]')
     config.insert_json5("scouting/multicast/enabled", "false")

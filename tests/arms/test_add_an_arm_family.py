@@ -1,4 +1,4 @@
-"""A family more, the lines of docs/add_an_arm_family.md, in a copy of the package."""
+"""The lines of docs/add_an_arm_family.md add a family of arms to a copy of the package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Families of arms: recognised from their screws, every arm found, finite at singular poses."""
+"""Closed-form arm families: recognition, completeness, and finite values at singular poses."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ KINDS = {
     "sawyer": "spherical wrist, joint 1 swept, joint 7 off it",
     "xarm6": "spherical wrist, joint 6 off it",
 }
-"""What the arms of the catalogue are, by their makers' drawings."""
+"""Kind of each arm of the catalogue, according to its maker's drawing."""
 
 SOLVED = ("kuka_lwr4", "panda", "xarm7", "kinova_gen3", "puma560", "irb140", "ur5e")
 OFFSET = {"sawyer": 0.1363, "xarm6": 0.076}
-"""How far [m] the last axis passes by."""
+"""Offset of the last axis from the wrist centre [m]."""
 ALL = (*SOLVED, *OFFSET)
-"""One of each kind."""
+"""One arm of each kind."""
 
 MODEL_ERROR = {"kinova_gen3": 2e-3, "baxter_left": 3e-2, "baxter_right": 3e-2}
-"""Poses [m] of arms that are solved as the nominal arm beside them."""
+"""Position error [m] of arms that are solved as a similar nominal arm."""
 
 
 @cache
@@ -75,7 +75,7 @@ def function(arm: ArmFamily) -> ca.Function:
 
 
 def arms(family_of_arm: ArmFamily, palm: Array, arm: Array, edge: float = 0.0) -> Array:
-    """All arms (k, n) in reach, a swept joint where a given arm has it; the swivel anywhere."""
+    """Return all arms (k, n) in reach; `arm` gives the value of a swept joint."""
     values = [
         0.4 if redundancy.joint is None else arm[redundancy.joint]
         for redundancy in family_of_arm.redundancy
@@ -88,7 +88,7 @@ def arms(family_of_arm: ArmFamily, palm: Array, arm: Array, edge: float = 0.0) -
 
 
 def moved_by(screws: Screws, angles: Array) -> Array:
-    """The palm's pose by the product of exponentials: no formula of the package."""
+    """Return the palm pose by the product of exponentials, without formulas of the package."""
     pose, zero = np.eye(4), np.eye(4)
     for axis, point, angle in zip(screws.axes, screws.points, angles, strict=True):
         step = np.eye(4)
@@ -100,7 +100,7 @@ def moved_by(screws: Screws, angles: Array) -> Array:
 
 
 def differences(angles: Array, reference: Array) -> Array:
-    """Largest difference of angles, whole turns aside."""
+    """Return the largest difference of angles modulo whole turns."""
     return np.abs(np.angle(np.exp(1j * (angles - reference)))).max(axis=-1, initial=0.0)
 
 
@@ -151,7 +151,7 @@ def test_solutions_reach_the_palm_and_include_the_generating_arm(name):
     ("name", "straight"), [("ur5e", 0.0), ("ur10e", np.pi), ("puma560", 0.0), ("irb140", 0.0)]
 )
 def test_solutions_reach_the_palm_near_wrist_singularities(name, straight):
-    """However near: what the directions of two short vectors say is not taken for nothing."""
+    """Near a singular wrist, the directions of two short vectors still count."""
     robot, screws, rng = robot_of(name), family(name).screws, np.random.default_rng(3)
     for power in range(3, 13):
         for q in robot.random(rng, 5):
@@ -165,7 +165,7 @@ def test_solutions_reach_the_palm_near_wrist_singularities(name, straight):
 
 @pytest.mark.parametrize("name", ALL)
 def test_singular_poses_lose_no_solution(name):
-    """Wrist aligned, elbow straight, wrist over the shoulder: finite, and the palm still there."""
+    """Aligned wrists, straight elbows and wrists above the shoulder keep a finite solution."""
     screws, rng = arm_screws(robot_of(name).description), np.random.default_rng(2)
     count, error = len(screws), MODEL_ERROR.get(name, 0.0)
     poses = [np.zeros(count), np.full(count, 1e-13)]
@@ -176,7 +176,7 @@ def test_singular_poses_lose_no_solution(name):
     for arm in poses:
         palm = moved_by(screws, arm)
         rows = arms(family(name), palm, arm, edge=1e-9)
-        # Stretched out, a nominal arm or an offset wrist may be a little short.
+        # A nominal arm or an offset wrist may be slightly too short when it is stretched out.
         assert len(rows) or error or name in OFFSET, arm
         for row in rows:
             assert np.abs(moved_by(screws, row) - palm).max() < 1e-4 + error
@@ -199,7 +199,7 @@ def test_reachable_poses_have_zero_distance_and_distant_poses_do_not(name):
 
 
 def moved_screws(screws: Screws, rng: np.random.Generator) -> Screws:
-    """The same arm on another base, with another zero and other points of its axes."""
+    """Return the same arm with another base, another zero and other points on its axes."""
     turn, shift = Rotation.random(random_state=rng.integers(1000)).as_matrix(), rng.normal(size=3)
     axes, points = screws.axes @ turn.T, screws.points @ turn.T + shift
     for i, angle in enumerate(rng.uniform(-3, 3, len(screws))):
@@ -218,7 +218,7 @@ def test_solutions_are_invariant_to_base_zero_and_point_choice(name):
         moved_arm = moved_screws(screws, rng)
         arm = family_of(moved_arm)
         assert arm is not None
-        # Of two that both are exact, either may come first where a link is along an axis.
+        # Either of two exact families may come first where a link lies along an axis.
         assert len(arm.redundancy) == len(family(name).redundancy)
         assert arm.model_error == pytest.approx(family(name).model_error, abs=1e-9)
         angles = rng.uniform(-2, 2, len(screws))
@@ -246,7 +246,7 @@ def test_small_model_deviations_keep_the_family():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda", "puma560", "irb140", "ur5e", "xarm6"])
 def test_numerical_search_finds_no_additional_solution(name):
-    """Least squares of SciPy on the product of exponentials, a swept joint held."""
+    """SciPy's least squares with a fixed swept joint finds no other solution."""
     screws, rng, columns, total = (
         arm_screws(robot_of(name).description),
         np.random.default_rng(4),
@@ -277,7 +277,7 @@ def test_numerical_search_finds_no_additional_solution(name):
 
 @pytest.mark.parametrize("name", SOLVED[1:])
 def test_solutions_include_those_of_eaik(name):
-    """EAIK (Ostermeier et al. 2024), by subproblems of its own."""
+    """EAIK (Ostermeier et al. 2024) solves the same poses by its own subproblems."""
     eaik = pytest.importorskip("eaik.IK_HP")
     robot, screws = robot_of(name), family(name).screws
     screws = screws.reversed() if screws.reverse else screws
@@ -301,7 +301,7 @@ def test_solutions_include_those_of_eaik(name):
 
 @pytest.mark.parametrize("name", OFFSET)
 def test_offset_wrist_search_loses_no_root(name):
-    """Against Brent's method between the signs of a scan of 720 turns, branch by branch."""
+    """Brent's method on a scan of 720 turns finds the same roots, branch by branch."""
     robot, family_arm = robot_of(name), family(name)
     assert isinstance(family_arm, OffsetWristArm)
     assert np.linalg.norm(family_arm.offset) == pytest.approx(OFFSET[name])
@@ -323,7 +323,7 @@ def test_offset_wrist_search_loses_no_root(name):
             for i in np.flatnonzero(crossed):
                 t = brentq(left, turns[i], turns[i + 1], xtol=1e-14)
                 six, slack, residual = condition(rotation, origin, t, *signs)
-                # Two arms near each other at the edge of reach may both be missed.
+                # Two arms that are close together at the edge of reach may both be missed.
                 if float(slack) < 0.05 or abs(float(residual)) > 1e-9:
                     continue
                 full_arm = np.array(family_arm._all_joints_function()(six, swept)).ravel()
@@ -334,7 +334,7 @@ def test_offset_wrist_search_loses_no_root(name):
 
 
 def srs_numbers(robot: ik.ArmHand):
-    """(palm, elbow sign, bounds (7,)) -> breakpoints (24,) of an S-R-S arm."""
+    """Return a Function (palm, elbow sign, bounds (7,)) -> breakpoints (24,) of an S-R-S arm."""
     arm = srs_arm(robot.description)
     assert arm is not None
     rotation, origin, sign = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3), ca.SX.sym("sign")
@@ -349,7 +349,7 @@ def srs_numbers(robot: ik.ArmHand):
 
 
 def at_swivels(robot: ik.ArmHand, palm: Array, swivels: Array) -> Array:
-    """(8 k, 7) all arms of an S-R-S arm at swivels (k,)."""
+    """Return all arms (8 k, 7) of an S-R-S arm at swivels (k,)."""
     arm = arm_family(robot.description)
     assert arm is not None
     rows = [function(arm)(palm[:3, :3], palm[:3, 3], psi)[0] for psi in swivels]
@@ -358,7 +358,7 @@ def at_swivels(robot: ik.ArmHand, palm: Array, swivels: Array) -> Array:
 
 @pytest.mark.slow
 def test_srs_breakpoints_are_where_joints_take_their_value(robot, rng):
-    """And where a bound is met at all, a joint stands at it at a breakpoint."""
+    """At a breakpoint, a joint is at a bound that some swivel meets."""
     numbers_of, tested = srs_numbers(robot), 0
     for q in robot.random(rng, 10):
         palm, sign, arm = robot.palm(q), np.sign(q[3]), q[:7]
@@ -370,7 +370,7 @@ def test_srs_breakpoints_are_where_joints_take_their_value(robot, rng):
             for end, at in zip(ends, of_joint, strict=True):
                 angles = at_swivels(robot, palm, at)[:, joint]
                 off = np.abs(np.sin((angles - end[joint]) / 2)).min()
-                # A bound that no swivel meets gives the closest approach instead.
+                # For a bound that no swivel meets, the breakpoint is the closest approach.
                 assert off < 1e-9 or off > 1e-6
                 tested += off < 1e-9
     assert tested > 20
@@ -398,7 +398,7 @@ def test_srs_solutions_with_other_links_and_mounts(heights, shift, turn, seed):
         robot = derived_robot(Path(folder), heights, (shift, turn))
     rng = np.random.default_rng(seed)
     q = robot.random(rng, 1)[0]
-    # At a straight elbow half the digits are lost, in any method.
+    # Any method loses half of the digits at a straight elbow.
     q[3] = np.copysign(max(abs(q[3]), 0.05), q[3])
     rows = at_swivels(robot, robot.palm(q), rng.uniform(-3, 3, 2))
     full_q = np.hstack([rows, np.tile(q[7:], (len(rows), 1))])
@@ -408,7 +408,7 @@ def test_srs_solutions_with_other_links_and_mounts(heights, shift, turn, seed):
 
 
 def test_non_srs_arms_are_not_recognised_as_srs(tmp_path, own_robot, coupled_robot):
-    """An elbow off the links, a shoulder apart, a skew axis, no arm at all."""
+    """An offset elbow, a split shoulder, a skew axis and a missing arm are not S-R-S."""
     (tmp_path / "elbow").mkdir()
     assert srs_arm(derived_robot(tmp_path / "elbow", elbow_offset=0.045).description) is None
     assert srs_arm(coupled_robot.description) is None
@@ -428,7 +428,7 @@ BENDS = [(s, e, w) for s in (1, -1) for e in (1, -1) for w in (1, -1)]
 
 
 class Arm:
-    """A robot, the branches of its arm, and its bounds."""
+    """Robot, branches of its arm, and bounds of the arm."""
 
     def __init__(self, name: str) -> None:
         self.robot = ik.load_robot(f"{name}+barrett_bh8_280")
@@ -462,7 +462,7 @@ def arm_of(name: str) -> Arm:
 
 @pytest.mark.parametrize("name", ["kuka_lwr4", "panda", "kinova_gen3", "xarm7"])
 def test_branch_intervals_equal_the_allowed_swivels(name):
-    """Against a scan of the whole redundancy, a branch at a time."""
+    """A scan of the whole redundancy, one branch at a time, finds the same intervals."""
     arm, inside_anywhere = arm_of(name), 0
     scan = np.linspace(*arm.range, 700)[1:-1] + 1e-4
     for palm, own_angles in arm.palms(1, 3):
@@ -479,13 +479,13 @@ def test_branch_intervals_equal_the_allowed_swivels(name):
             in_branch = np.any([arm.contains(b, scan) for b in of_kind] or [scan > 1e9], axis=0)
             np.testing.assert_array_equal(in_branch, margins[:, row] >= 0)
             inside_anywhere += int(in_branch.sum())
-        # The ends are where something is at a limit, or where the arm is stretched out.
+        # An interval ends where a joint is at a limit or the arm is stretched out.
         for branch in branches:
             ends = arm.branches.arms(palm, branch, np.array(branch.swivel))
             assert (arm.margin(ends) > -1e-6).all()
             if arm.around and branch.swivel[1] - branch.swivel[0] < 2 * np.pi - 1e-9:
                 np.testing.assert_allclose(arm.margin(ends), 0, atol=1e-7)
-        # The configuration itself, turned by whole turns, is one of them.
+        # The configuration itself is among them, up to whole turns.
         arms_of_branches = [
             arm.branches.arms(palm, b, np.linspace(*b.swivel, 2000)) for b in branches
         ]
@@ -499,7 +499,7 @@ def test_branch_intervals_equal_the_allowed_swivels(name):
 
 @pytest.mark.parametrize("name", ["ur5e", "puma560", "irb140", "xarm6"])
 def test_six_joint_arms_have_single_branches(name):
-    """The arm that a palm pose was made with, turned by whole turns, is among them."""
+    """The arm that generated a palm pose is among the solutions, up to whole turns."""
     arm = arm_of(name)
     for palm, own_angles in arm.palms(2, 8):
         branches = arm.branches.find(palm, *arm.bounds)

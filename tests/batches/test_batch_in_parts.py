@@ -1,4 +1,4 @@
-"""Batches in parts: the same answers whoever solves them, and nothing lost or done twice."""
+"""Batches in parts give the same answers on every kind of worker, and lose or repeat nothing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PARTS = ("--part-size", str(SIZE))
 
 @pytest.fixture(scope="module")
 def targets(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Targets that can be reached, one that cannot be asked, in one file."""
+    """Write reachable targets and a malformed one into a file."""
     points, normals = robot.contacts(robot.random(np.random.default_rng(4), COUNT))
     points[321, 0, 0] = np.inf
     path = tmp_path_factory.mktemp("targets") / "targets.npz"
@@ -40,7 +40,7 @@ def targets(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path
 def unbroken_answers(
     targets: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, np.ndarray]:
-    """The answers of a batch in one go."""
+    """Return the answers of the batch in one part."""
     out = tmp_path_factory.mktemp("whole") / "out.npz"
     assert main(["batch", str(targets), *ROBOT, "--out", str(out)]) == 1
     return answers(out)
@@ -59,7 +59,7 @@ def assert_same_arrays(actual: dict[str, np.ndarray], expected: dict[str, np.nda
 
 
 def begun(*words: object) -> subprocess.Popen[str]:
-    """The command line as a process of its own."""
+    """Start the command line in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-m", "casadi_ik", "batch", *map(str, words)],
         stdout=subprocess.PIPE,
@@ -71,7 +71,7 @@ def begun(*words: object) -> subprocess.Popen[str]:
 
 
 def wait_for_parts(folder: Path, minimum: int, process: subprocess.Popen[str]) -> list[Path]:
-    """Wait until so many parts are there, or the process has ended."""
+    """Wait until that many parts exist or the process has ended."""
     end = time.monotonic() + 6000
     while time.monotonic() < end:
         parts = sorted(folder.glob("part-*.npz"))
@@ -86,7 +86,7 @@ def wait_for_parts(folder: Path, minimum: int, process: subprocess.Popen[str]) -
 def test_killed_batch_resumes(
     targets: Path, unbroken_answers: dict[str, np.ndarray], tmp_path: Path
 ):
-    """The client is killed; what it had finished is kept as it is, and the rest is done."""
+    """After the client is killed, its finished parts are kept and only the others are solved."""
     out, folder = tmp_path / "out.npz", tmp_path / "out.npz.parts"
     words = (targets, *ROBOT, *PARTS, "--resume", "--out", out, "--log", tmp_path / "logs")
     process = begun(*words)
@@ -116,7 +116,7 @@ def test_killed_batch_resumes(
 @pytest.mark.slow
 @POSIX
 def test_terminated_batch_resumes(targets: Path, tmp_path: Path):
-    """SIGTERM to the client alone: the finished parts stay, its workers do not."""
+    """After SIGTERM to the client alone, finished parts are kept and its workers end."""
     out = tmp_path / "out"
     process = begun(targets, *ROBOT, *PARTS, "--resume", "--jobs", "2", "--out", out)
     wait_for_parts(out, 3, process)
@@ -142,7 +142,7 @@ def alive(group: int) -> bool:
 
 @pytest.fixture
 def cluster() -> Iterator[tuple[str, subprocess.Popen[str], list[subprocess.Popen[str]]]]:
-    """A scheduler and two workers."""
+    """Start a scheduler and two workers."""
     with ExitStack() as stack:
         scheduler, address = stack.enter_context(scheduler_process())
         workers = [stack.enter_context(worker_process(address)) for _ in range(2)]
@@ -182,7 +182,7 @@ def test_cluster_survives_lost_worker_and_scheduler(
 def test_folder_of_files_and_table_give_the_same_answers(
     targets: Path, robot: ik.ArmHand, unbroken_answers: dict[str, np.ndarray], tmp_path: Path
 ):
-    """A Parquet file and an npz file, one after the other."""
+    """Write the batch to a Parquet file, then to an npz file."""
     with np.load(targets) as arrays:
         points, normals = arrays["points"][:250].copy(), arrays["normals"][:250]
     columns = {

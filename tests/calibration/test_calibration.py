@@ -1,4 +1,4 @@
-"""Calibration: the graphs, the estimate and its error bars, and what data cannot tell."""
+"""Calibration: graphs, estimates, error bars, and directions that the data do not determine."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def index(ar10) -> HandModel:
 
 @pytest.fixture(scope="module")
 def estimate(index) -> Calibration:
-    """From 60 poses, every tenth an outlier, of a hand that is not the described one."""
+    """Return an estimate from 60 poses with outliers of a hand unlike its description."""
     rng = np.random.default_rng(3)
     data = simulate(index, true_values(index, rng), "index", 60, rng, outliers=0.1)
     return calibrate(index, data)
@@ -79,7 +79,7 @@ def test_exact_data_are_explained_exactly(index, rng):
     fresh = simulate(index, truth, "index", 50, rng, noise=EXACT)
     error, _ = index.misfit("index", fresh.q, result.values, fresh.poses)
     assert np.abs(error[:, :3]).max() < 1e-6
-    # In directions that matter the deviation is that of the truth.
+    # In observable directions, the standard deviation is that of the truth.
     strong = result.singular_values > 1e3
     x, x_true = ((v - index.nominal) / index.prior for v in (result.values, truth))
     assert strong.sum() > 15
@@ -90,7 +90,7 @@ def test_exact_data_are_explained_exactly(index, rng):
 
 @pytest.mark.parametrize("loss", LOSSES)
 def test_error_bars_are_true(loss, index):
-    """About 95 % of the 95 % intervals contain the true value, with outliers too."""
+    """Error bars of 95 % contain the true value about that often, also with outliers."""
     within_bars, noise = [], []
     for seed in range(12):
         rng = np.random.default_rng(seed)
@@ -130,7 +130,7 @@ def test_outliers_are_found_and_cost_little(index):
 
 
 def test_data_cannot_tell_the_size_of_a_four_bar(ar10, rng):
-    """Angles know only ratios: (p, q, g, h) grown together changes nothing."""
+    """Angles determine ratios only: scaling (p, q, g, h) together changes nothing."""
     parameters = hand_parameters(ar10.description, ["index"], ["linkage"])
     model = HandModel(ar10.description, parameters)
     result = calibrate(model, simulate(model, model.nominal, "index", 40, rng))
@@ -140,7 +140,7 @@ def test_data_cannot_tell_the_size_of_a_four_bar(ar10, rng):
         i = names.index(f"index_distal.{key}")
         growth[i] = result.values[i] / model.prior[i]
     for joint in ("index_proximal", "index_middle"):
-        # A triangle does know its size: the slider is measured in metres.
+        # A triangle has an observable size, because the slider is measured in metres.
         assert result.learned[names.index(f"{joint}.c")] > 0.5
     growth /= np.linalg.norm(growth)
     unobservable = result.directions[result.singular_values < 1e-6 * result.singular_values[0]]
@@ -166,7 +166,7 @@ def test_points_alone_are_enough_for_a_smaller_estimate(index, rng):
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_few_poses_keep_priors_and_assumed_noise(count, index):
-    """No overconfidence: with too few data to show their noise, the assumed one stands."""
+    """With too few data to estimate the noise, the assumed noise is used."""
     within_bars = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -180,7 +180,7 @@ def test_few_poses_keep_priors_and_assumed_noise(count, index):
 
 
 def test_bounds_hold(index, rng):
-    """Data of a hand far off: no number leaves three prior deviations."""
+    """With data of a very different hand, no parameter leaves three prior deviations."""
     edge_values = index.nominal + 2.9 * index.prior * np.sign(rng.standard_normal(len(index.prior)))
     result = calibrate(index, simulate(index, edge_values, "index", 60, rng))
     x = (result.values - index.nominal) / index.prior
@@ -208,7 +208,7 @@ def test_the_written_description_is_the_estimated_hand(name, index, estimate, tm
     np.testing.assert_array_equal(
         points[:, other_fingers], described.contacts(q)[0][:, other_fingers]
     )
-    # The strokes are what limits the calibrated joints, too.
+    # The strokes limit the calibrated joints, too.
     joints = robot.joints(np.linspace(robot.lower, robot.upper, 50))
     for joint in robot.description.movable:
         if joint.name.startswith("index"):
@@ -228,7 +228,7 @@ def test_a_file_of_measurements_round_trip(index, ar10, tmp_path, rng):
     np.testing.assert_array_equal(read.has_orientation, measurements.has_orientation)
     np.testing.assert_allclose(point(read.poses), point(measurements.poses), atol=1e-15)
     np.testing.assert_allclose(read.poses[0], measurements.poses[0], atol=1e-14)
-    # Actuators that do not move the finger are at home, whatever the file says.
+    # Actuators that do not move the finger are at home, whatever the file states.
     columns = [ar10.actuators.index(f"index_{part}_slider") for part in ("proximal", "middle")]
     np.testing.assert_array_equal(read.q[:, columns], measurements.q[:, columns])
 

@@ -1,4 +1,4 @@
-"""What the tests of the command line share."""
+"""Results of commands, and targets for the tests of the command line."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class Run:
     err: str
 
     def fine(self) -> Run:
-        """The same, after making sure that it is done without a word on stderr."""
+        """Return the result after checking success and an empty stderr."""
         assert (self.exit, self.err) == (0, ""), self
         return self
 
     @property
     def error(self) -> str:
-        """Line of a refusal after the program's name."""
+        """Message of a refusal, without the name of the program."""
         assert self.exit == 2, self
         assert self.out == ""
         assert self.err.count("\n") == 1, self.err
@@ -45,5 +45,5 @@ Command = Callable[..., Run]
 
 
 def solvable(robot: ik.ArmHand, count: int) -> tuple[Any, Any]:
-    """Points and normals of a posture that the robot can reach, so many times."""
+    """Return (count, f, 3) points and normals of one reachable configuration, repeated."""
     return robot.contacts(np.tile(POSTURE, (count, 1)))

@@ -1,4 +1,4 @@
-"""A grasp and targets that can be solved, and the command line to be called on them."""
+"""Fixtures that call the command line, and files for it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import casadi_ik as ik
 
 @pytest.fixture
 def run(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Calls the command line in this process."""
+    """Function that calls the command line in this process."""
 
     def call(*words: object) -> Run:
         code = main([str(word) for word in words])
@@ -30,7 +30,7 @@ def run(capsys: pytest.CaptureFixture[str]) -> Command:
 
 @pytest.fixture
 def run_process(tmp_path: Path) -> Command:
-    """Calls the command line in a process of its own."""
+    """Function that calls the command line in a process of its own."""
 
     def call(*words: object, **options: Any) -> Run:
         done = python("-m", "casadi_ik", *words, cwd=tmp_path, **options)
@@ -41,7 +41,7 @@ def run_process(tmp_path: Path) -> Command:
 
 @pytest.fixture(scope="session")
 def contacts(robot: ik.ArmHand) -> dict[str, dict[str, list[float]]]:
-    """Contacts of the robot in a posture it can reach, as a grasp file has them."""
+    """Contacts of a reachable configuration, in the form of a grasp file."""
     points, normals = robot.contacts(POSTURE)
     return {
         name: {"point": points[i].tolist(), "normal": normals[i].tolist()}
@@ -51,7 +51,7 @@ def contacts(robot: ik.ArmHand) -> dict[str, dict[str, list[float]]]:
 
 @pytest.fixture
 def grasp_file(tmp_path: Path, contacts: dict[str, Any]) -> Callable[..., Path]:
-    """Writes a grasp file; keyword arguments replace top-level keys, None takes one away."""
+    """Function that writes a grasp file; keyword arguments replace keys, None deletes one."""
 
     def write(name: str = "pinch.yaml", **changes: Any) -> Path:
         data = {"robot": "kuka_lwr_barrett", "contacts": contacts} | changes
@@ -64,7 +64,7 @@ def grasp_file(tmp_path: Path, contacts: dict[str, Any]) -> Callable[..., Path]:
 
 @pytest.fixture
 def far_away(grasp_file: Callable[..., Path], contacts: dict[str, Any]) -> Path:
-    """A valid grasp file that no one can reach."""
+    """Valid grasp file of a grasp out of reach."""
     far_contacts = {
         name: {"point": [x + 5.0 for x in contact["point"]], "normal": contact["normal"]}
         for name, contact in contacts.items()
@@ -74,7 +74,7 @@ def far_away(grasp_file: Callable[..., Path], contacts: dict[str, Any]) -> Path:
 
 @pytest.fixture
 def target_file(tmp_path: Path, robot: ik.ArmHand) -> Callable[..., Path]:
-    """Writes three targets that can be reached; keyword arguments replace arrays."""
+    """Function that writes three reachable targets; keyword arguments replace arrays."""
 
     def write(name: str = "targets.npz", count: int = 3, **changes: Any) -> Path:
         points, normals = solvable(robot, count)
@@ -87,7 +87,7 @@ def target_file(tmp_path: Path, robot: ik.ArmHand) -> Callable[..., Path]:
 
 @pytest.fixture(scope="session")
 def ranked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Answers of `choose`, on a table."""
+    """Ranked grasps of `casadi-ik choose` on a table."""
     folder = tmp_path_factory.mktemp("ranked")
     contacts = {
         name: {"point": contact.point.tolist(), "normal": contact.normal.tolist()}

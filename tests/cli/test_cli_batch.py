@@ -1,4 +1,4 @@
-"""`casadi-ik batch`: arrays in, arrays out."""
+"""`casadi-ik batch`: arrays as input and output."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def test_unsolved_rows_are_listed(
 def test_jobs_and_start_match_the_api(
     run: Command, target_file: TargetFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
-    """Whole numbers are numbers, too."""
+    """Integers are accepted as numbers."""
     path, out = target_file(count=6), tmp_path / "solved.npz"
     up = target_file("up.npz", normals=np.tile(np.array([0, 0, 1], dtype=np.int16), (3, 3, 1)))
     assert run("batch", up, *ROBOT, *FAST, "--out", out).exit in (0, 1)
@@ -77,7 +77,7 @@ def test_jobs_and_start_match_the_api(
 
 @pytest.fixture
 def hands(robot: ik.ArmHand, tmp_path: Path) -> Callable[[int], Path]:
-    """Writes random hands, every seventh out of reach and one malformed."""
+    """Function that writes random targets, every seventh out of reach and one malformed."""
 
     def write(count: int) -> Path:
         points, normals = robot.contacts(robot.random(np.random.default_rng(5), count))
@@ -99,7 +99,7 @@ def test_results_are_independent_of_blocks_and_jobs(
     method: str,
     count: int,
 ) -> None:
-    """Nor does it matter how the arrays lie in the file; a log numbers the rows of the file."""
+    """The layout of the arrays in the file does not matter; a log numbers the rows of the file."""
     answers = []
     for block, jobs in ((4096, 1), (5, 2), (1, 1)):
         monkeypatch.setattr("casadi_ik.app.cli.batch.MAX_BLOCK", block)
@@ -160,7 +160,7 @@ def test_a_table_needs_polars(
 
 
 def test_process(run_process: Command, target_file: TargetFile, tmp_path: Path) -> None:
-    """A damaged end of the file is found before anything is solved, and nothing is left."""
+    """A damaged end of the file is detected before solving, and nothing is left behind."""
     path, out = target_file(count=50), tmp_path / "o.npz"
     done = run_process("batch", path, *ROBOT, "--out", out).fine()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["o.npz", "targets.npz"]

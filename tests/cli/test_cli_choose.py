@@ -19,7 +19,7 @@ PLACE = ("--object-pose", "-0.82", "0.127", "0.41", "0", "0", "0.3")
 
 
 def entry(angle: float) -> dict[str, Any]:
-    """The cup's grasp turned about the cup, in its frame, as a file has it."""
+    """Return the grasp of the cup, turned about the cup in its frame, in the form of a file."""
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
     grasp = ik.load_grasp("cup").in_object_frame().at(turn)
@@ -98,7 +98,7 @@ def test_failed_choice_counts_reasons(run: Command, candidates: Path, tmp_path: 
 
 
 def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
-    """A table's hands stay as they are; where their palms came to is in what is written."""
+    """Hand postures of a table stay as they are, and their palms are written."""
     robot, out = ik.load_robot(ROBOT), tmp_path / "ranked.json"
     q = robot.random(np.random.default_rng(5), 8)
     palms, motors = robot.palm(q), robot.actuators[7:]

@@ -1,4 +1,4 @@
-"""Files: outputs that cannot be written are found first; inputs larger than any are refused."""
+"""Files: unwritable outputs are detected before solving; oversized inputs are refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TargetFile = Callable[..., Path]
 
 @pytest.fixture
 def unsolved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The solver must not be called in this test."""
+    """Make every call of the solver fail."""
     monkeypatch.setattr(ik.Solver, "solve_batch", None)
 
 
@@ -200,7 +200,7 @@ def test_oversized_files_are_refused(
     robot: ik.ArmHand,
     tmp_path: Path,
 ) -> None:
-    """Limits a thousand times as small as usual stand for files a thousand times as large."""
+    """Size limits reduced by a factor of 1000 stand for files that are 1000 times larger."""
     path = tmp_path / name
     write(path, robot)
     out = tmp_path / {"batch": "out.npz", "choose": "out.json", "follow": "out.csv"}[command]
@@ -226,7 +226,7 @@ def test_limit_option_admits_large_files(
 def test_arrays_that_are_larger_than_their_files(
     run: Command, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
-    """A head that says more numbers than there are, and members that are no arrays."""
+    """Headers that claim too many numbers, and members without arrays, are refused."""
     path = tmp_path / "frames.npz"
     np.save(tmp_path / "a.npy", np.zeros((3, 3, 3)))
     data = (tmp_path / "a.npy").read_bytes()

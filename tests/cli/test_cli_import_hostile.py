@@ -1,4 +1,4 @@
-"""`casadi-ik import` of files that nobody means well with: one line, soon, and nothing runs."""
+"""`casadi-ik import` of hostile files: one line, within a bounded time, and no code is executed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ ROBOT = """<robot name="hand" {namespace}>{head}
 
 
 def robot(path: Path, head: str = "", place: str = "0.1") -> Path:
-    """A hand of two fingers; what stands in it may hold macros."""
+    """Write a hand of two fingers; its text may contain macros."""
     path.write_text(ROBOT.format(namespace=NAMESPACE, head=head, place=place))
     return path
 
@@ -135,7 +135,7 @@ HEAD = """<xacro:arg name="side" default="left"/>
 def test_standard_xacro_constructs_are_expanded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: Command, lead: str
 ) -> None:
-    """Properties, arguments, conditions, yaml of the folder, and packages, wherever they are."""
+    """Properties, arguments, conditions, YAML files of the folder, and packages are expanded."""
     pytest.importorskip("pinocchio")
     urdf_folder = tmp_path / "robots" / "hand" / "urdf"
     urdf_folder.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""`casadi-ik log`: what a person or a script sees, in processes of their own."""
+"""`casadi-ik log`: output for people and for scripts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import casadi_ik as ik
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> Path:
-    """Two methods on four targets, of which the last is out of reach; one solve torn off."""
+    """Logs of two methods on four targets, the last one out of reach, and an incomplete log."""
     folder = tmp_path_factory.mktemp("logs")
     points, normals = robot.contacts(np.tile(POSTURE, (4, 1)))
     points[:, :, 2] += 0.01 * np.arange(4)[:, None]

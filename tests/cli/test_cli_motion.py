@@ -1,4 +1,4 @@
-"""`casadi-ik follow` and `reach`: motions, read back by others; what cannot be is said."""
+"""`casadi-ik follow` and `reach`: motions that other readers understand, and refused input."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RETARGET = "fingers: {thumb: 4, finger_2: 8, finger_3: 12}\nlow_pass: 0.5\n"
 
 @pytest.fixture
 def path(robot: ik.ArmHand) -> Any:
-    """(30, n) a slow motion."""
+    """Slow motion (30, n)."""
     return POSTURE + 0.1 * np.sin(np.linspace(0, np.pi, 30))[:, None] * np.sin(np.arange(14))
 
 
@@ -104,7 +104,7 @@ def test_world_landmarks_are_reported_and_period_is_not_smoothed(
         assert "MediaPipe's world landmarks" in " ".join(done.out.split())
         motion = np.load(out)
         ends.append(robot.contacts(motion["q"][np.searchsorted(motion["times"], 0.9)])[0])
-    # As smooth at a fast cycle as at a slow one.
+    # The smoothing does not depend on the cycle time.
     assert np.linalg.norm(ends[0] - ends[1], axis=1).max() < 2e-3
 
 
@@ -153,7 +153,7 @@ def test_distant_grasp_has_no_motion(run: Command, tmp_path: Path) -> None:
 
 
 def test_chosen_grasp_is_reached(run: Command, ranked: Path, tmp_path: Path) -> None:
-    """The first of several, or another, by the very posture; with the object in the hand."""
+    """Each of several grasps is reached in its own configuration, with the object in hand."""
     out, entries = tmp_path / "way.npz", json.loads(ranked.read_text())["ranked"]
     words = ("reach", ranked, "--scene", "table", "--out", out)
     distances = []

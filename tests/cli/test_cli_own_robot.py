@@ -1,4 +1,4 @@
-"""`casadi-ik import` and `calibrate`: from somebody's files to a robot that is solved."""
+"""`casadi-ik import` and `calibrate`: from the files of a user to a robot that is solved."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ PHALANX = """<collision><origin xyz="0 0 {middle}"/><geometry>
 def moves(
     name: str, parent: str, child: str, xyz: str, axis: str, limits: str, **attributes: str
 ) -> str:
-    """A joint between limits, or one that turns without end."""
+    """Return a joint between limits, or a continuous one."""
     low, high = limits.split() if limits else ("", "")
     attributes |= {"limit": f'lower="{low}" upper="{high}" velocity="0" effort="1"'}
     return joint(name, parent, child, xyz=xyz, axis=axis, **attributes)
 
 
 def hand(folder: Path, shapes: bool = True) -> Path:
-    """Two fingers at y = -40 mm that bend to +y, and one at +40 mm that bends to -y."""
+    """Write two fingers at y = -40 mm that bend to +y, and one at +40 mm that bends to -y."""
     end = PHALANX.format(middle=0.02, length=0.04) if shapes else ""
     text = link("palm")
     for name, x, side in (("ff", -0.03, -1), ("mf", 0.03, -1), ("opposed", 0.0, 1)):
@@ -43,7 +43,7 @@ def hand(folder: Path, shapes: bool = True) -> Path:
 
 
 def arm(folder: Path) -> Path:
-    """Six joints, then a fixed flange; the last joint turns without end."""
+    """Write an arm of six joints, the last one continuous, with a fixed flange."""
     text = link("base", *(f"l{i}" for i in range(6)), "tool_flange")
     links = ["base", *(f"l{i}" for i in range(6))]
     for i, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")):
@@ -71,7 +71,7 @@ def test_import_and_solve(run_process: Command, tmp_path: Path, rng: np.random.G
         "mine.yaml",
     ]
     robot = ik.load_robot(tmp_path / "mine.yaml")
-    # The file calls two fingers; the third bends against them.
+    # The file names two fingers; the third one bends against them.
     assert robot.fingers == ("thumb", "index", "middle")
     assert robot.thumb == "thumb"
     assert (np.abs(robot.home - (robot.lower + robot.upper) / 2) < np.pi / 2 + 0.01).all()
@@ -93,7 +93,7 @@ def test_closed_form_is_reported_and_its_absence_warned_about(run: Command, tmp_
     assert "spherical wrist" in done.out
     assert "no known closed form" not in done.out
     out.unlink()
-    # The last two axes moved aside: no two of the last three meet any more.
+    # With the last two axes displaced, no two of the last three axes intersect.
     offset_text = (
         path.read_text().replace("0.08 0 0", "0.08 0 0.06").replace("0.1 0 0", "0.1 0 0.05")
     )
@@ -112,7 +112,8 @@ def test_guessed_pads_are_on_the_skin_of_the_closing_side(run: Command, tmp_path
     for name, side in (("thumb", -1), ("index", 1), ("middle", 1)):
         pad = data["fingers"][name]
         np.testing.assert_allclose(pad["normal"], [0, side, 0], atol=1e-6)
-        # A box of 16 mm, 40 mm long: 8 mm from its end, in the middle of its side.
+        # The box is 16 mm thick and 40 mm long: the pad is 8 mm from its end, in the middle of its
+        # side.
         np.testing.assert_allclose(pad["xyz"], [0, side * 0.008, 0.032], atol=1e-6)
 
 
@@ -135,7 +136,7 @@ def test_options_override_guesses(run: Command, tmp_path: Path) -> None:
 
 
 def humanoid(folder: Path, robot: ik.ArmHand) -> Path:
-    """A body's file, to whose base a leg and a head are added."""
+    """Write the file of a multi-arm robot with an additional leg and a head."""
     text = robot.urdf().replace("</robot>", "")
     for name, kind in (("leg", "-1 -0.2"), ("head", "-0.5 0.5")):
         text += link(name) + moves(name, robot.description.root, name, "0 0 1", "0 1 0", kind)
@@ -218,7 +219,7 @@ def test_palm_with_arms_as_fingers_is_warned_about(run: Command, tmp_path: Path)
 
 
 def chain(folder: Path, names: Sequence[str], root: str = "base") -> str:
-    """Links and joints of an arm in a row, each 0.1 m from the one before."""
+    """Return links and joints of a serial arm with distances of 0.1 m."""
     text, parent = "", root
     for i, name in enumerate(names):
         axis = ("0 0 1", "0 1 0", "0 1 0", "1 0 0")[i % 4]
@@ -362,7 +363,7 @@ def test_picture(run: Command, tmp_path: Path) -> None:
 
 
 def gripper(folder: Path) -> Path:
-    """An arm whose gripper has a propeller, which turns without end, beside two jaws on a motor."""
+    """Write an arm whose gripper has a continuous propeller beside two jaws with one motor."""
     path = arm(folder)
     text = path.read_text().replace("</robot>", "")
     body = '<collision><geometry><mesh filename="{}"/></geometry></collision>'
@@ -400,7 +401,7 @@ def test_relative_meshes_are_found_and_a_propeller_is_not_a_thumb(
     assert "    gripper: 0  # continuous joint" in text
     points, _ = robot.contacts(robot.home)  # on the jaws' inner sides, which meshes tell
     assert np.linalg.norm(points[0] - points[1]) == pytest.approx(2 * (robot.home[-1] - 0.005))
-    # What the comment says may be deleted may be deleted.
+    # The comment permits deleting these lines.
     assert "delete its line under `fingers`" in text
     lines = text.splitlines(keepends=True)
     remaining_lines = [x for x in lines if not x.startswith(("thumb:", f"  {robot.thumb}: {{link"))]
@@ -430,7 +431,7 @@ ROW = "index,0.0485,0.0512,-0.0466,0.0921,0.1607,0.0831,0.7023,-0.0829,0.7021\n"
 
 @pytest.fixture
 def refused(run: Command, tmp_path: Path) -> Callable[..., str]:
-    """Calls `calibrate` and gives the refusal; nothing may be written."""
+    """Function that calls `calibrate`, returns its refusal, and checks that no file is written."""
 
     def call(path: Path, *words: Any, out: str = "out.yaml", robot: str = "ar10") -> str:
         files_before = sorted(tmp_path.rglob("*"))
@@ -443,7 +444,7 @@ def refused(run: Command, tmp_path: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def poses(tmp_path: Path) -> Path:
-    """Forty measured points of a finger, a few of them far off."""
+    """Forty measured points of a finger with a few outliers."""
     robot, rng = ik.load_robot("ar10"), np.random.default_rng(1)
     q = robot.random(rng, 40)
     points = robot.contacts(q)[0][:, robot.fingers.index("index")] + rng.normal(0, 2e-4, (40, 3))
@@ -506,7 +507,7 @@ def test_bad_csv(text: str, fragment: str, refused: Callable[..., str], tmp_path
 
 @pytest.fixture
 def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Modules as robot_descriptions has them once files are downloaded; not the package itself."""
+    """Modules with the layout of robot_descriptions, with local files."""
     folder = tmp_path / "site" / "robot_descriptions"
     folder.mkdir(parents=True)
     (folder / "__init__.py").touch()

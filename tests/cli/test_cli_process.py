@@ -1,4 +1,4 @@
-"""The program as the shell sees it: lists, help, exit codes, signals."""
+"""The program in a shell: lists, help, exit codes, signals."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_lists(command: str, names: tuple[str, ...], run: Command) -> None:
 
 
 def commands(run: Command, group: str = "") -> Iterator[str]:
-    """The commands that help names, with those that they have."""
+    """Yield the commands that the help names, with their subcommands."""
     text = run(*group.split(), "--help").out
     for line in text.partition("\ncommands:")[2].partition("\n\n")[0].splitlines()[1:]:
         name = f"{group} {line.split()[0]}".strip()
@@ -63,7 +63,7 @@ def commands(run: Command, group: str = "") -> Iterator[str]:
 
 
 def test_help(run: Command) -> None:
-    """Help fits a terminal of 80 columns; the program shows it without arguments."""
+    """Help fits a terminal of 80 columns, and is also printed without arguments."""
     names = ["", *commands(run)]
     assert {"solve", "batch", "view", "log", "log info", "log merge"} < set(names)
     for command in names:
@@ -77,7 +77,7 @@ def test_help(run: Command) -> None:
 
 @pytest.mark.parametrize("name", sorted(COMMANDS.keys() - GROUPS.keys()))
 def test_help_texts_are_short(name: str) -> None:
-    """They have at most 60 characters, the default included."""
+    """Help texts have at most 60 characters, including the default."""
     for option in load(name).options:
         assert len(option.help_text) <= 60, option.name
 
@@ -177,7 +177,7 @@ def test_poor_terminal(run_process: Command) -> None:
 
 @POSIX
 def test_ctrl_c_while_modules_are_imported() -> None:
-    """Without waiting for the right moment: whoever imports CasADi sends the signal."""
+    """A module that imports CasADi sends the signal, so that no timing is involved."""
     code = """if True:
     import os, signal, sys
     class Finder:
@@ -247,7 +247,7 @@ def test_interrupted(
 
 
 def start_batch(targets: Path, out: Path, *options: str) -> subprocess.Popen[str]:
-    """A batch that takes minutes."""
+    """Start a batch that takes minutes."""
     return subprocess.Popen(
         [*PROGRAM, "batch", targets, "--robot", ROBOT, "--out", out, *options],
         stdout=subprocess.PIPE,

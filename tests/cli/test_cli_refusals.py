@@ -204,7 +204,7 @@ LINES = [line for line in CASES.splitlines() if line]
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory, robot: ik.ArmHand) -> Path:
-    """A folder with all files that are spoken of."""
+    """Folder with all files that the cases name."""
     folder, (points, normals) = tmp_path_factory.mktemp("refusals"), solvable(robot, 3)
     rows = zip(robot.fingers, points[0].tolist(), normals[0].tolist(), strict=True)
     contacts = {name: {"point": point, "normal": normal} for name, point, normal in rows}
@@ -267,7 +267,7 @@ def test_bad_rows_are_named_and_the_others_solved(
     robot: ik.ArmHand,
     tmp_path: Path,
 ) -> None:
-    """The first ten of them; all are counted."""
+    """The first ten bad rows are named; all of them are counted."""
     path, out = target_file(**change(*solvable(robot, 30))), tmp_path / "o.npz"
     done = run("batch", path, *ROBOT.split(), "--out", out)
     named = [f"casadi-ik: bad row: {path}: {fault.format(row=row)}" for row in range(0, 20, 2)]

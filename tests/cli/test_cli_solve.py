@@ -1,4 +1,4 @@
-"""`casadi-ik solve`: the answer, the report, the files, and why a grasp cannot be solved."""
+"""`casadi-ik solve`: the answer, the report, the files, and the explanation of a failure."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_answers_match_the_api(
 def test_solve_options_are_accepted(
     run: Command, grasp_file: GraspFile, own_robot: Path, tmp_path: Path
 ) -> None:
-    """Numbers with commas and spaces, other tolerances, the paper's step, a robot of one's own."""
+    """Numbers with commas and spaces, tolerances, and a user's robot are accepted."""
     numbers = ["-1e-3", "0.5", *["0.1"] * 12]
     for start in ([",".join(numbers)], numbers, [",".join(numbers[:7]), " ".join(numbers[7:])]):
         assert run("solve", grasp_file(), *FAST, "--q0", *start).exit in (0, 1)
@@ -75,7 +75,7 @@ def test_solve_options_are_accepted(
     assert run("solve", grasp_file(), "--method", "enhanced-dls").exit == 0
     path = grasp_file(robot="no_such_robot")
     assert run("solve", path, *FAST, "--robot", own_robot).exit == 0
-    # A path in the file counts from the file.
+    # A relative path in a file is relative to that file.
     path = grasp_file(robot=str(own_robot.relative_to(tmp_path)))
     assert run("solve", path, *FAST).exit == 0
 
@@ -103,7 +103,7 @@ def test_unsolved_grasp_is_explained(run: Command, far_away: Path, tmp_path: Pat
     assert done.out.startswith("UNREACHABLE")
     report = json.loads(out.read_text())
     diagnosis = report["diagnosis"]
-    # A tolerance of more than 20 mm and 15 deg is no advice.
+    # A tolerance above 20 mm and 15 deg is not suggested.
     assert "solvable within" not in " ".join(done.out.split())
     assert diagnosis["enough"]["position"] > 0.02
     assert (report["status"], diagnosis["reason"]) == ("UNREACHABLE", "REACH")
@@ -181,7 +181,7 @@ def test_limits_that_are_ignored(
 def test_joints_beyond_their_limits_are_named(
     coupled_robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Joints that follow an actuator by a coupling are named too, each once."""
+    """Coupled joints beyond their limits are named once each."""
     monkeypatch.setitem(sys.modules, "casadi_ik.app.pictures.thumbnail", None)
     description = coupled_robot.description
     for q in coupled_robot.random(np.random.default_rng(0), 20):
@@ -204,7 +204,7 @@ def test_joints_beyond_their_limits_are_named(
 def test_contacts_go_with_the_object(
     run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path: Path
 ) -> None:
-    """The file says nothing of an object: its contacts are in the frame that is placed."""
+    """Without an object in the file, its contacts are in the frame of --object-pose."""
     out = tmp_path / "pinch.json"
     turn = ["0.0", "0.0", "-0.01", "0", "0", "0.2"]
     done = run("solve", grasp_file(), *FAST, "--out", out, "--object-pose", *turn)
@@ -227,7 +227,7 @@ def test_effort_is_limited_and_degrees_are_detected(run: Command, robot: ik.ArmH
 
 @pytest.mark.slow
 def test_units(run: Command, grasp_file: GraspFile, robot: ik.ArmHand, tmp_path: Path) -> None:
-    """Degrees and mm where they are asked for; the answer is the same, files are in rad and m."""
+    """Degrees and mm are used on request; the answer is the same, and files are in rad and m."""
     path, out = grasp_file(), tmp_path / "o.json"
     start = [f"{value:.17g}" for value in np.rad2deg(robot.home)]
     tolerances = ("--tolerance-position", "2", "--tolerance-angle", "1")

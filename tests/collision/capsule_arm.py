@@ -1,4 +1,4 @@
-"""A small robot with shapes of all kinds: an arm of three joints and a hand of three fingers."""
+"""Small robot with shapes of all kinds: an arm of three joints and a hand of three fingers."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ HAND = {
 
 
 def write_robot(folder: Path) -> Path:
-    """The robot's file, beside those of its parts."""
+    """Write the robot and its parts, and return the path of the robot's file."""
     (folder / "three.yaml").write_text(yaml.safe_dump(ARM))
     (folder / "pincers.yaml").write_text(yaml.safe_dump(HAND))
     top = {

@@ -1,4 +1,4 @@
-"""The same shapes and pairs by coal, from poses by the compiled forward kinematics."""
+"""The shapes and pairs of a robot in coal, as an oracle for distances."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import casadi_ik as ik
 
 
 def described(robot: ik.ArmHand) -> list[tuple[str, Any, np.ndarray]]:
-    """Link, shape and (4, 4) pose in the link of every shape as it is described."""
+    """Return link, shape and (4, 4) pose in the link of every described shape."""
     shapes = robot.description.shapes
     solids: list[tuple[str, Any, np.ndarray]] = []
     for capsule in shapes.capsules:
@@ -32,14 +32,14 @@ def described(robot: ik.ArmHand) -> list[tuple[str, Any, np.ndarray]]:
 
 
 def frame_along(axis: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation whose z is an axis."""
+    """Return a (3, 3) rotation whose z axis is the given axis."""
     side = np.cross(axis, np.eye(3)[int(np.abs(axis).argmin())])
     side /= np.linalg.norm(side)
     return np.column_stack([side, np.cross(axis, side), axis])
 
 
 def in_scene() -> dict[str, tuple[Any, np.ndarray]]:
-    """The scene's shapes with their poses."""
+    """Return the shapes of the scene with their poses."""
     solids: dict[str, tuple[Any, np.ndarray]] = {}
     for name, entry in SCENE.items():
         pose = np.eye(4)
@@ -69,7 +69,7 @@ def in_scene() -> dict[str, tuple[Any, np.ndarray]]:
 
 
 def distance(solid: Any, at_one: np.ndarray, other_solid: Any, at_other: np.ndarray) -> float:
-    """Signed distance [m]."""
+    """Return the signed distance [m]."""
     request, result = coal.DistanceRequest(True), coal.DistanceResult()
     places = (coal.Transform3s(pose[:3, :3], pose[:3, 3]) for pose in (at_one, at_other))
     first, second = places

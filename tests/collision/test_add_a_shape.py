@@ -1,4 +1,4 @@
-"""One more kind of solid, the lines of docs/add_a_shape.md, in a copy of the package."""
+"""The lines of docs/add_a_shape.md add a kind of solid to a copy of the package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The search for preferred free arms of hands, and for where unconstrained fingers have room."""
+"""Search for preferred collision-free arms, and for clearance of unconstrained fingers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def solver(robot) -> ik.Solver:
 
 @pytest.fixture(scope="module")
 def hands(robot, solver):
-    """Hands in reach, where the arms stand, and what they are checked against."""
+    """Reachable hands, the arms that reach them, and their collision query."""
     rng = np.random.default_rng(5)
     q = robot.random(rng, 60)
     around = query_at(solver, q)
@@ -67,7 +67,7 @@ def scores(search, hands, arms, prefer):
 @pytest.mark.parametrize("branches", [False, True])
 @pytest.mark.parametrize("prefer", PREFERENCES)
 def test_compiled_search_is_no_worse_than_numpy(search, plain, robot, hands, prefer, branches):
-    """Both search the same values, and the values between them."""
+    """Both searches cover the same values and the values between them."""
     compiled, simple = (
         run_search(arm_search, robot, hands, prefer, branches) for arm_search in (search, plain)
     )
@@ -84,12 +84,12 @@ def test_compiled_search_is_no_worse_than_numpy(search, plain, robot, hands, pre
     if not branches:
         np.testing.assert_array_equal(compiled.hand_index, simple.hand_index)
         better = scores(search, hands, compiled, prefer) - scores(search, hands, simple, prefer)
-        # What is between the values may be better than what is about the best of them.
+        # A value between samples may be better than the neighbourhood of the best sample.
         assert np.mean(better >= -1e-9) > 0.7
 
 
 def test_compiled_search_uses_custom_preferences(search, robot, hands):
-    """And its error comes through."""
+    """The error of a thread is raised."""
 
     def high(q):
         return robot.palm(q)[:, 2, 3] - np.abs(q[:, 3] - 1.0)
@@ -108,7 +108,7 @@ def test_compiled_search_uses_custom_preferences(search, robot, hands):
 
 
 def test_best_collision_free_arm_is_chosen(search, robot, hands):
-    """Any free arm of the same hand found by other means is no farther from its limits."""
+    """No other collision-free arm of the same hand is farther from its limits."""
     q, _, around, _ = hands
     arms = run_search(search, robot, hands, "limits")
     is_free = around.free(q)[arms.hand_index]

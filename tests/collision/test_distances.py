@@ -1,4 +1,4 @@
-"""Distances against coal: nothing is called free that coal calls penetrating."""
+"""Distances compared with coal: what coal reports as penetrating is never free."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def surroundings(robot: ik.ArmHand, scene: ik.Scene, compiled: bool = True) -> C
 
 
 def by_coal(robot: ik.ArmHand, q: np.ndarray, names: set[frozenset[str]]) -> np.ndarray:
-    """(k, pairs) the smallest signed distance of each pair of names."""
+    """Return the smallest signed distance of each pair of names (k, pairs) [m]."""
     shapes, scene = described(robot), in_scene()
     links = robot.links(q)
     distances = {name: np.full(len(q), np.inf) for name in names}
@@ -56,7 +56,7 @@ def test_distances_match_coal_and_are_conservative(robot, rng):
         )
         coals = theirs[name]
         is_apart = coals > 0
-        # Conservative wherever coal sees a gap, and whatever penetrates for coal does for us.
+        # Distances are conservative where coal reports a gap, and agree on penetration.
         assert (ours[is_apart] <= coals[is_apart] + MICROMETRE).all(), name
         assert (ours[~is_apart] <= MICROMETRE).all(), name
         if not (name & solids) and "block" not in name:
@@ -64,7 +64,7 @@ def test_distances_match_coal_and_are_conservative(robot, rng):
                 ours[is_apart], coals[is_apart], atol=2e-6, err_msg=str(name)
             )
         if len(name & solids) == 1 and not (name & set(SCENE)):
-            # A capsule against a box or a cylinder of the robot itself is exact too.
+            # Distances of capsules to boxes and cylinders of the robot itself are exact, too.
             np.testing.assert_allclose(
                 ours[is_apart], coals[is_apart], atol=2e-6, err_msg=str(name)
             )
@@ -99,7 +99,7 @@ def test_virtual_machine_gives_the_same_distances(robot, rng):
 
 @pytest.mark.parametrize("name", ["three", "ar10"])
 def test_distances_change_at_most_by_the_displacement_bound(robot, rng, name):
-    """Joints that turn, slide, and follow sliders over linkages."""
+    """Robot with revolute, prismatic and coupled joints."""
     robot, scene = (
         (robot, ik.Scene(SCENE)) if name == "three" else (ik.load_robot(name), ik.Scene())
     )

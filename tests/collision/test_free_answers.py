@@ -1,4 +1,4 @@
-"""Answers in a scene: a free one is chosen; where there is none the verdict says what blocks."""
+"""Answers in a scene: a collision-free one, or a verdict that names the obstacle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_shipped_grasps_have_collision_free_solutions_on_a_table(solver, robot, 
     assert solution.status is ik.Status.SOLVED, solution.collision
     assert solution.clearance >= 0
     assert solution.closest is not None
-    # The verdict is one on q: asked again from the answer alone.
+    # The verdict depends on q only: it is the same for the answer as a start.
     points, normals = grasp.arrays(robot.fingers)
     position, angle = robot.errors(solution.q, points, normals)
     assert (position <= 5e-3).all()
@@ -31,7 +31,7 @@ def test_shipped_grasps_have_collision_free_solutions_on_a_table(solver, robot, 
 
 
 def test_choice_finds_candidates_that_contacts_alone_miss(solver, robot):
-    """Without a choice some of these answers touch something; with it none does."""
+    """Without the search some answers collide; with it none does."""
     grasps = [ik.load_grasp(name) for name in ik.shipped_grasps(robot.name)]
     blind = ik.Solver(robot)
     touching = 0
@@ -113,7 +113,7 @@ def test_batches_match_single_solves(solver, robot):
 
 
 def test_wrong_number_of_object_poses_is_refused(solver):
-    """The driver reads as many poses as there are configurations."""
+    """The driver reads one pose per configuration."""
     cup = ik.load_grasp("cup")
     around = query_of_grasps(solver, [cup, cup])
     with pytest.raises(ik.errors.InputError, match="2 poses for 3 configurations"):
@@ -152,7 +152,7 @@ def test_solver_with_scene_can_be_copied(solver):
 
 
 def test_rows_have_independent_answers(solver, robot):
-    """Whatever targets are solved with it: bit for bit, those included that have none."""
+    """Answers do not depend on the other targets of a batch, bit for bit."""
     rng = np.random.default_rng(4)
     points, normals = robot.contacts(robot.random(rng, 40))
     batch = solver.solve_batch(points, normals)

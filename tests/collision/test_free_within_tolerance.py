@@ -1,4 +1,4 @@
-"""Answers among obstacles to targets that a free configuration meets only within tolerance."""
+"""Targets among obstacles that a collision-free configuration meets only within tolerance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Point clouds about a robot: as far as so many balls, whatever file they come from."""
+"""Point clouds near a robot act like balls at their points, for every kind of file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
 
 
 def surfaces(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Points (count, 3) of a floor, a wall and a ball, as a camera sees them."""
+    """Return points (count, 3) of a floor, a wall and a ball, as a camera measures them."""
     flat = rng.uniform([-0.8, -0.8, -0.21], [0.8, 0.8, -0.2], (count, 3))
     wall = rng.uniform([0.55, -0.5, -0.2], [0.56, 0.5, 0.8], (count, 3))
     directions = rng.normal(size=(count, 3))
@@ -37,14 +37,14 @@ def cloud(points: np.ndarray, **fields: object) -> ik.Scene:
 
 
 def clearances(robot: ik.ArmHand, scene: ik.Scene, q: np.ndarray, **options: bool) -> np.ndarray:
-    """(k,) with everything that is checked [m]."""
+    """Return the clearance of all checked pairs (k,) [m]."""
     verdicts = ik.Solver(robot, scene=scene, **options).check(q, grasp_at(robot, robot.home))
     assert verdicts is not None
     return verdicts.distance
 
 
 def by_hand(robot: ik.ArmHand, points: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """(k,) least distance of the robot's capsules from balls about points [m]."""
+    """Return the least distance (k,) of the robot's capsules from balls at points [m]."""
     links, clearance = robot.links(q), np.full(len(q), np.inf)
     for capsule in robot.description.shapes.capsules:
         if capsule.link == "base":
@@ -80,7 +80,7 @@ def test_cloud_equals_its_balls(robot, rng):
         clearances(robot, ik.Scene(balls), q),
     )
     np.testing.assert_allclose(cloud_clearance, ball_clearance, atol=1e-12)
-    # The robot's capsules alone, which coal knows as they are: it never sees less room.
+    # coal has the capsules exactly, so that its clearance is never smaller.
     import coal
 
     shapes = [
@@ -122,7 +122,7 @@ def test_thinned_clouds_are_conservative(robot, rng):
 
 
 def written(folder: Path, points: np.ndarray) -> list[Path]:
-    """The points in all kinds of files."""
+    """Files of all kinds with the same points."""
     rows = [" ".join(f"{value:.17g}" for value in row) for row in points]
     np.save(folder / "a.npy", points)
     np.savez(folder / "b.npz", points=points, colors=points)
@@ -173,7 +173,7 @@ def written(folder: Path, points: np.ndarray) -> list[Path]:
 
 
 def pack_lzf(data: bytes) -> bytes:
-    """Compress as LZF does: literals of at most 32 bytes, and references to what came before."""
+    """Compress by the LZF format: literals of at most 32 bytes, and references to earlier bytes."""
     packed, literals, positions, place = bytearray(), bytearray(), dict[bytes, int](), 0
 
     def flush() -> None:
@@ -287,11 +287,11 @@ def test_bad_cloud_arrays_and_keys_are_refused(tmp_path):
 
 
 def test_solutions_keep_clear_of_a_cloud(rng):
-    """A grasp in a scene that is a cloud alone: free, and why it is not where there is no way."""
+    """In a scene with only a cloud, the answer is free, or the cloud is the obstacle."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     bare = ik.Solver(robot, scene=ik.Scene()).solve(grasp)
     assert bare.success
-    # Points about the elbow of the answer that nothing stands in the way of.
+    # Points around the elbow of the answer of the free scene.
     elbow = robot.links(bare.q)["lwr_link_4"][:3, 3]
     scene = cloud(elbow + rng.uniform(-0.05, 0.05, (2000, 3)))
     solver = ik.Solver(robot, scene=scene)

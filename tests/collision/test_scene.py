@@ -1,4 +1,4 @@
-"""Scenes: read, moved, and refused in one line."""
+"""Scenes are read, moved, and refused in one line."""
 
 from __future__ import annotations
 

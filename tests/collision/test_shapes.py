@@ -1,4 +1,4 @@
-"""Shapes of robots: described, of somebody's files, written as URDF; told apart, and refused."""
+"""Shapes of robots: descriptions, fitted shapes of imported files, URDF output, and refusals."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SIMPLE = {
 
 
 def write_hand(folder: Path, right_2: str = '<sphere radius="0.01"/>') -> Path:
-    """Two fingers of two links each, opposed, with a shape on every link."""
+    """Write a hand of two opposed fingers of two links each, with a shape on every link."""
     shapes = SIMPLE | {"right_2": right_2}
     text = "".join(
         f'<link name="{name}"><collision>{PLACE}<geometry>{shape}</geometry></collision></link>\n'
@@ -54,7 +54,7 @@ def write_hand(folder: Path, right_2: str = '<sphere radius="0.01"/>') -> Path:
 
 
 def write_mesh(folder: Path, rng: np.random.Generator) -> np.ndarray:
-    """A bent slab as an STL; its corners."""
+    """Write a bent slab as an STL file and return its corners."""
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.01, 0.01, 5), np.linspace(0, 1, 9)))
     top = np.column_stack([x, 0.02 * y * y, 0.05 * y]) + rng.normal(0, 1e-4, (45, 3))
     points = np.concatenate([top, top + np.array([0, 0.006, 0])])
@@ -193,7 +193,7 @@ def test_robot_without_shapes_takes_no_scene(tmp_path):
     ],
 )
 def test_shipped_robots_are_collision_free_at_home(name):
-    """At home no two links touch that are checked: the shapes are not too large to be of use."""
+    """At home no checked links touch: the shapes are not too large."""
     robot = ik.load_robot(name)
     check = SceneCheck(robot, ik.Scene(), compiled=False)
     solver = ik.Solver(robot, scene=ik.Scene(), compiled=False)
@@ -205,7 +205,7 @@ def test_shipped_robots_are_collision_free_at_home(name):
 @pytest.mark.parametrize(
     ("arm", "link", "corner"),
     [
-        # Corners [mm] of what is seen of them: dexsuite/dex-urdf at 93505db3c0b2 (iiwa),
+        # Corners [mm] of visual meshes: dexsuite/dex-urdf at 93505db3c0b2 (iiwa),
         # example-robot-data 6.0.0 (Jaco, UR10), robosuite 1.5.2 (Sawyer, bullet_data).
         ("iiwa14", "iiwa14_link_2", [-55.0, -237.3, 40.0]),
         ("iiwa7", "iiwa7_link_2", [34.0, -216.8, -58.9]),
@@ -215,7 +215,7 @@ def test_shipped_robots_are_collision_free_at_home(name):
     ],
 )
 def test_shapes_enclose_the_visible_arm(arm, link, corner):
-    """The corners that stood out the most of shapes fitted to what is there for collisions."""
+    """The outermost corners of collision meshes stand out of the fitted shapes by little."""
     shapes = ik.load_robot(f"{arm}+barrett_bh8_280").description.shapes
     point = np.array(corner) / 1e3
     separations = []
@@ -250,7 +250,7 @@ def test_simple_shapes_are_read_from_the_description(tmp_path: Path) -> None:
         ("right_2", 0.01),
     ]
     np.testing.assert_allclose(spheres[0].center, [0, 0, 0.02])
-    # What the description says of a link goes before its file.
+    # Shapes of a link in the description replace those of its file.
     collision_text = "collision: {links: {palm: [{kind: sphere, radius: 5 cm}]}}\n"
     path.write_text(DESCRIPTION + collision_text)
     palm = [
@@ -288,7 +288,7 @@ def test_imported_shapes_enclose_the_meshes(tmp_path: Path, rng) -> None:
     excess = float(fitted[0]["excess"].removesuffix(" mm"))
     assert 0 < excess < 20
     description = robots.load_description(out)
-    # In the link's frame the mesh is turned as the file has it.
+    # The mesh has the pose of the file in the link's frame.
     pose = frame_matrix(Frame((0, 0, 0.02), (0.3, 0.2, 0.1)))
     mesh = points @ pose[:3, :3].T + pose[:3, 3]
     separation = np.full(len(mesh), np.inf)
@@ -321,7 +321,7 @@ def test_imported_shapes_enclose_the_meshes(tmp_path: Path, rng) -> None:
 
 
 def test_written_shapes_round_trip(tmp_path: Path) -> None:
-    """Shapes come back from the YAML as they were."""
+    """Shapes survive writing and reading the YAML file."""
     shapes = {
         "a link": [
             LinkBoxEntry(size=(0.1, 0.2, 0.3), xyz=(0.01, 0, 0), rpy=(0.1, 0, 0), excess=0.004)
@@ -337,7 +337,7 @@ def test_written_shapes_round_trip(tmp_path: Path) -> None:
 
 
 def test_capsule_overhang_is_bounded_from_few_points():
-    """The same as every sample against every point, and every corner held."""
+    """The result is that of every sample against every point, with all corners covered."""
     rng = np.random.default_rng(0)
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     low, high = np.array([-0.05, -0.02, -0.1]), np.array([0.05, 0.03, 0.1])
@@ -378,7 +378,7 @@ def test_shapes_come_back_from_the_urdf(tmp_path):
     model = pinocchio.buildModelFromXML(text)
     geometry = pinocchio.buildGeomFromUrdfString(model, text, pinocchio.GeometryType.COLLISION)
     kinds = sorted(type(item.geometry).__name__ for item in geometry.geometryObjects)
-    # Four capsules of a cylinder and two spheres each, a sphere, two boxes and a cylinder.
+    # Four capsules (a cylinder and two spheres each), a sphere, two boxes and a cylinder.
     assert kinds == ["Box"] * 2 + ["Cylinder"] * 5 + ["Sphere"] * 9
     box = next(
         item for item in geometry.geometryObjects if model.frames[item.parentFrame].name == "l2"
@@ -390,7 +390,7 @@ def test_shapes_come_back_from_the_urdf(tmp_path):
 
 
 def test_equal_meshes_of_two_links_get_equal_shapes(rng):
-    """In any order of triangles and except for rounding; a mirrored mesh is not equal."""
+    """The order of triangles and rounding do not matter; a mirrored mesh is not equal."""
     t = np.array([0.02, 0.0, 0.02])
     mesh = trimesh.util.concatenate(
         [

@@ -1,4 +1,4 @@
-"""What else would do where every answer touches something, and margins of single pairs."""
+"""Remedies where every answer collides, and margins of single pairs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from casadi_ik.collision.distances import gaps
 
 
 def test_suggested_remedies_work(robot) -> None:
-    """A ball over the cup: it is said how far the cup has to go, and there it has an answer."""
+    """With a ball over the cup, the stated displacement of the cup gives a free answer."""
     cup = ik.load_grasp("cup")
     ball = {"kind": "sphere", "radius": 0.16, "xyz": (cup.object_pose[:3, 3] + [0.1, 0, 0.2])}
     solver = ik.Solver(robot, scene=ik.Scene({"ball": ball}))
@@ -52,7 +52,7 @@ def test_an_object_is_not_moved_into_the_table() -> None:
 
 
 def test_margins_of_single_pairs(robot) -> None:
-    """A pair's own margin goes before the solid's and the scene's; the clearance stays true."""
+    """The margin of a pair overrides other margins; the clearance is unchanged."""
     post = {"kind": "box", "size": [0.1, 0.1, 0.4], "xyz": [0.5, 0.5, 0.2], "margin": 0.03}
     smaller_margins = [{"links": ["lwr_link_6", "post"], "margin": 0.002}]
     clearances = []

@@ -1,4 +1,4 @@
-"""Other people's grasps: what is written in a layout is read as it was; nothing in it is run."""
+"""Public data sets of grasps are read as their layouts define them; no code in them is executed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ KUKA = "kuka_lwr_barrett"
 
 @pytest.mark.parametrize("name", [*ik.shipped_names("datasets"), *TABLES])
 def test_round_trip(name: str, tmp_path: Path) -> None:
-    """Palms, postures and fingertips of a file are those that it was made from."""
+    """Palms, postures and fingertips equal those that a file was made from."""
     if name.endswith(".parquet"):
         pytest.importorskip("polars")
     written = made(name, tmp_path)
@@ -51,7 +51,7 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", sorted(PUBLISHED))
 def test_conventions_agree_with_the_published_hands(name: str) -> None:
-    """The distal links are where another library has them in the published model."""
+    """The poses of distal links equal those of another library with the published model."""
     published, convention = PUBLISHED[name], load_convention(name)
     described = ik.load_robot(ROBOTS.get(name.split("_")[1], KUKA)).description
     values = np.array([list(published["joints"].values())])
@@ -62,7 +62,7 @@ def test_conventions_agree_with_the_published_hands(name: str) -> None:
     poses = link_poses(described.root, described.joints, positions)
     back = convention.frames(hand_poses)[0] @ np.linalg.inv(poses[convention.link])
     children = {joint.name: joint.child for joint in described.joints}
-    # The little finger of DexGraspNet's model begins 1.7 mm beside the hand's.
+    # The little finger of DexGraspNet's model starts 1.7 mm beside that of the hand.
     within = 2e-3 if name == "dexgraspnet_shadow" else 1.5e-4
     for theirs, place in published["last"].items():
         ours = back @ poses[children[convention.joints[theirs][0]]]
@@ -70,7 +70,7 @@ def test_conventions_agree_with_the_published_hands(name: str) -> None:
 
 
 def test_palm_poses_are_reached(tmp_path: Path) -> None:
-    """`solve`, `solve_all`, `choose` and YAML take a palm and a posture as given."""
+    """`solve`, `solve_all`, `choose` and YAML files take a palm and a posture as given."""
     robot = ik.load_robot(KUKA)
     solver = ik.Solver(robot)
     q = robot.random(np.random.default_rng(3), 6)
@@ -124,7 +124,7 @@ def test_palm_poses_are_reached(tmp_path: Path) -> None:
 
 
 def test_many_palms() -> None:
-    """Hands that differ from row to row stay as they are, in one thread or two."""
+    """Hand postures that differ from row to row stay as they are, in one thread or two."""
     robot = ik.load_robot(KUKA)
     solver = ik.Solver(robot)
     q = robot.random(np.random.default_rng(4), 60)
@@ -185,7 +185,7 @@ def test_bad_postures(change: Any, says: str) -> None:
 
 
 def _table(tmp_path: Path, **changes: Any) -> Path:
-    """A table of one grasp; a change of None leaves a column out."""
+    """Write a table of one grasp; None as a change deletes a column."""
     robot = ik.load_robot(KUKA)
     columns: dict[str, Any] = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.1)
     columns |= dict.fromkeys(robot.description.finger_motors, 0.5)
@@ -220,7 +220,7 @@ def test_bad_tables(changes: dict[str, Any], says: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
 def test_columns_that_are_not_joints(suffix: str, tmp_path: Path) -> None:
-    """A pandas table has an index, a score, a note, and an empty cell."""
+    """A pandas table may have an index, a score, a note, and an empty cell."""
     path = _table(tmp_path)
     head, row = path.read_text().splitlines()
     lines = ["0,{},0.9,good", "1,{},0.8,bad", "2,{},,good"]
@@ -304,7 +304,7 @@ SIZES = (0.06, 0.08, 0.1, 0.12, 0.15)
 
 
 def _dexgraspnet(tmp_path: Path, rows_beyond_limits: int = 0) -> Written:
-    """A file as the data set has them: distal joints free, five sizes of the object by turns."""
+    """Write a file like the data set: independent distal joints, five sizes of the object."""
     written = made("dexgraspnet_shadow", tmp_path)
     entries, rng = np.load(written.path, allow_pickle=True), np.random.default_rng(1)
     for i, entry in enumerate(entries):
@@ -317,7 +317,7 @@ def _dexgraspnet(tmp_path: Path, rows_beyond_limits: int = 0) -> Written:
 
 
 def _tips(robot: ik.ArmHand, grasp: ik.Grasp, postures: np.ndarray) -> np.ndarray:
-    """(k, f, 3) fingertips in the frame of the palm, of postures (k, m)."""
+    """Return fingertips (k, f, 3) in the palm frame of postures (k, m)."""
     q = np.tile(robot.home, (len(postures), 1))
     q[:, [robot.actuators.index(name) for name in grasp.posture]] = postures
     palms = robot.palm(q)
@@ -325,7 +325,7 @@ def _tips(robot: ik.ArmHand, grasp: ik.Grasp, postures: np.ndarray) -> np.ndarra
 
 
 def test_free_joints_of_a_data_set(tmp_path: Path) -> None:
-    """Distal joints of the Shadow hand follow the middle ones; no posture's tips are nearer."""
+    """Distal joints of the Shadow hand follow the middle ones; no posture has nearer fingertips."""
     written = _dexgraspnet(tmp_path)
     robot, rng = written.robot, np.random.default_rng(2)
     grasps = ik.load_candidates(written.path, robot, scale=SIZES[0])
@@ -400,7 +400,7 @@ def test_rows_beyond_limits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_invalid_rows_can_be_dropped(tmp_path: Path) -> None:
-    """NaN, millimetres, no rotation, or no pad at the object: such rows can be left out."""
+    """Rows with NaN, millimetres, an invalid rotation, or no pad at the object can be left out."""
     arrays, robot = _getagrip(), ik.load_robot("panda+allegro_right")
     wrong = {name: np.repeat(array, 3, axis=0) for name, array in arrays.items()}
     wrong["trans"][1, 0], wrong["trans"][2, 0], wrong["rot"][3] = np.nan, 310.0, 0.0
@@ -451,7 +451,7 @@ def test_pregrasp_and_squeeze_stages(name: str, tmp_path: Path) -> None:
 
 
 class _Runs:
-    """A plain reader of pickles would call the content."""
+    """A plain unpickler would call the content."""
 
     def __init__(self, function: Any, *arguments: Any) -> None:
         self.held = function, arguments
@@ -482,7 +482,7 @@ def test_pickles_execute_nothing(build: Any, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["getagrip_allegro", "multidex_allegro"])
 def test_damaged_pickles(name: str, tmp_path: Path) -> None:
-    """Every cut and many changes of a file end in one line, or in grasps."""
+    """Every truncation and many changes of a file give one error line or grasps."""
     written = made(name, tmp_path).path
     pickled, path = written.read_bytes(), tmp_path / f"cut{written.suffix}"
     robot, rng = ik.load_robot("panda+allegro_right"), np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""What is grasped may be a mesh, or several convex parts that are one object."""
+"""A grasped object may be a mesh, or several convex parts that form one object."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _box(size: tuple[float, float, float], at: tuple[float, float, float]) -> tr
 
 
 def _arch() -> list[trimesh.Trimesh]:
-    """A handle: two posts and a beam about a hole of 1 by 1, in convex pieces."""
+    """Write a handle in convex pieces: two posts and a beam around a hole of 1 by 1."""
     posts = [_box((0.2, 0.2, 1.0), (side * 0.6, 0.0, 0.0)) for side in (-1, 1)]
     return [*posts, _box((1.4, 0.2, 0.2), (0.0, 0.0, 0.6))]
 
@@ -35,7 +35,7 @@ def _written(path: Path, parts: list[trimesh.Trimesh]) -> Path:
 
 
 def _grasp_file(folder: Path, thumb_at: np.ndarray) -> Path:
-    """A file of one grasp whose thumb is at a place of the object's frame."""
+    """Write a file of one grasp whose thumb is at a point of the object frame."""
     path = folder / "set.npy"
     arrays = {
         "trans": np.zeros((1, 3)),
@@ -51,7 +51,7 @@ def _grasp_file(folder: Path, thumb_at: np.ndarray) -> Path:
 
 @pytest.mark.parametrize("kind", ["obj", "stl", "ply"])
 def test_mesh_distances_match_the_solid(kind: str, tmp_path: Path) -> None:
-    """Two boxes that touch are one: what is between them is inside; a hole is outside."""
+    """Two touching boxes are one solid: the space between them is inside, a hole is outside."""
     halves = [_box((0.1, 0.12, 0.08), (side * 0.05, 0.0, 0.0)) for side in (-1, 1)]
     body = grasps.load_object(
         _written(tmp_path / f"a.{kind}", [_box((0.2, 0.12, 0.08), (0, 0, 0))])
@@ -69,7 +69,7 @@ def test_mesh_distances_match_the_solid(kind: str, tmp_path: Path) -> None:
 
 
 def test_pads_touch_the_mesh(tmp_path: Path) -> None:
-    """A mesh counts as its surface, not as its hull; several files are one object."""
+    """A mesh is its surface, not its convex hull; several files form one object."""
     mesh = _written(tmp_path / "handle.obj", _arch())
     files = [_written(tmp_path / f"{i}.stl", [part]) for i, part in enumerate(_arch())]
     path = _grasp_file(tmp_path, 0.1 * np.array([0.49, 0.0, 0.0]))
@@ -99,7 +99,7 @@ def test_mesh_takes_the_scale_of_the_data(tmp_path: Path) -> None:
 
 
 def test_collisions_with_convex_parts(robot: ik.ArmHand, tmp_path: Path) -> None:
-    """The arm goes through a handle; through the hull of it it does not."""
+    """The arm passes through a handle, but not through the hull of the handle."""
     _written(tmp_path / "handle.obj", _arch())
     names = [_written(tmp_path / f"{i}.stl", [part]).name for i, part in enumerate(_arch())]
     grasp = ik.load_grasp("cup")

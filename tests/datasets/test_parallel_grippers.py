@@ -1,4 +1,4 @@
-"""Grasps of parallel grippers, written in the published layouts, become those of any gripper."""
+"""Grasps of parallel grippers in the published layouts become grasps of any gripper."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import casadi_ik as ik
 ROBOTS = ("panda+panda_hand", "ur5e+robotiq_2f85", "viperx_300s+so100_jaw")
 COUNT = 8
 HAND_TCP = 0.1034
-"""Pads' middle before the base of the Panda hand, as in `franka_hand.xacro` [m]."""
+"""Midpoint of the pads in front of the base of the Panda hand, as in `franka_hand.xacro` [m]."""
 
 
 def grasp_frames(rng: np.random.Generator) -> np.ndarray:
-    """Poses (k, 4, 4): z approaches, y opens, the origin is midway between the pads."""
+    """Return poses (k, 4, 4): z approaches, y opens, the origin is midway between the pads."""
     frames = np.tile(np.eye(4), (COUNT, 1, 1))
     frames[:, :3, :3] = Rotation.random(COUNT, random_state=rng).as_matrix()
     frames[:, :3, 3] = rng.uniform(-0.1, 0.1, (COUNT, 3))
@@ -42,7 +42,7 @@ def write(layout: str, folder: Path, frames: np.ndarray, widths: np.ndarray) -> 
         rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3], rows[:, 16] = 0.5, widths, 0.02, 0.03, 7
         x, y, z = frames[:, :3, 2], frames[:, :3, 1], -frames[:, :3, 0]
         rows[:, 4:13] = np.stack([x, y, z], axis=2).reshape(COUNT, 9)
-        # The fingertips of the Panda hand end 8.8 mm beyond the pads' middle.
+        # The fingertips of the Panda hand end 8.8 mm beyond the middle of the pads.
         rows[:, 13:16] = frames[:, :3, 3] + (0.0088 - 0.03) * x
         path = folder / "graspnet.npy"
         np.save(path, rows)

@@ -1,4 +1,4 @@
-"""Files of torch, read without torch: what one of its own holds, and what is wrong with others."""
+"""Files of torch, read without torch: their contents and their faults."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from casadi_ik.integrations.datasets.unpickling import read_torch
 
 
 def test_torch_file_is_read() -> None:
-    """By torch 2.13: strides, kinds of numbers, empty and single ones; grasps of two objects."""
+    """A file of torch 2.13 has strides, several dtypes, empty and scalar tensors."""
     path = Path(__file__).parent / "written_by_torch.pt"
     content = read_torch(path)
     assert content["view"].array.tolist() == np.arange(12.0).reshape(3, 4).T[1:].tolist()
@@ -55,7 +55,7 @@ def test_bad_torch_files(content: Any, says: str, tmp_path: Path) -> None:
 
 
 def test_torch_files_of_other_kinds(tmp_path: Path) -> None:
-    """The format before torch 1.6, no torch file at all, and tensors beyond their numbers."""
+    """The format before torch 1.6, other files, and tensors beyond their storage are refused."""
     path = tmp_path / "set.pt"
     path.write_bytes(pickle.dumps(0x1950A86A20F9469CFC6C, 2))
     with pytest.raises(ik.errors.DescriptionError, match=r"torch 1\.6"):

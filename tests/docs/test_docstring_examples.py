@@ -1,4 +1,4 @@
-"""Every public name has an example in its docstring, and every example does what it says."""
+"""Every public name has an example in its docstring, and all examples pass."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ WITHOUT_EXAMPLE = {
     "logs.detect_events",  # takes what a recorder is given while a batch runs
 }
 METHODS_TOO = ("ArmHand", "Solver", "Grasp", "Contact", "Scene", "papers.ScrewControl", "logs.Log")
-"""Classes of which every method has an example of its own, apart from those named here."""
+"""Classes of which every method has an example of its own, and their exceptions."""
 PLAIN = {
     "ArmHand.configuration",  # checks and copies
     "ArmHand.frames_at",  # contact_frames without checks
@@ -55,7 +55,7 @@ def public_object(name: str) -> Any:
 
 
 def methods_of(name: str) -> list[str]:
-    """Public methods of a class, inherited ones too."""
+    """Return the public methods of a class, including inherited ones."""
     value = public_object(name)
     return [
         f"{name}.{attribute}"
@@ -94,7 +94,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def names(folder: Path) -> dict[str, Any]:
-    """Objects that the examples use without defining them, as the API page shows them."""
+    """Objects that the examples use without defining them, as on the API page."""
     robot, grasp = ik.load_robot("kuka_lwr_barrett"), ik.load_grasp("cup")
     solver = ik.Solver(robot)
     offset_pose = np.eye(4)

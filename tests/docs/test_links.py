@@ -1,4 +1,4 @@
-"""What is said of a built site whose links lead nowhere."""
+"""The check of links of the built site reports dead links."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the pages show people to type and to run: it exists, is accepted, is solved, runs."""
+"""Commands, Python code and files of the pages are valid, and run in the order of each page."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"^    (casadi-ik .*)$", re.MULTILINE)
 FILE_NAME = re.compile(r"# (\w+\.yaml)\b")
-"""First line of a block of YAML that is meant to be saved."""
+"""First line of a YAML block that readers save."""
 
 WITH_OUTPUT = re.compile(r"^```python\n((?:(?!```).)*)^```\n\n```text\n(.*?)^```", re.M | re.S)
-"""A block of Python, and what it prints."""
+"""Python block with its output."""
 
 NOT_PASTED = {
     "add_a_method",
@@ -42,27 +42,27 @@ NOT_PASTED = {
     "add_an_arm_family",
     "your_robot",
 }
-"""Python of the others belongs into modules, for which each has a test of its own; that of
+"""Pages whose Python blocks belong into modules and have tests of their own; that of
 `your_robot` stands between commands and is run with them."""
 
 GRASP = re.compile(r"^( *)contacts:.*\n(?:\1 +\w+: +\{point.*\n)+", re.MULTILINE)
-"""A grasp in a docstring."""
+"""Grasp in a docstring."""
 
 STEP = re.compile(
     r"^```python\n(?P<python>.*?)^```|^```sh\n.*?^```|^```.*?^```|^    casadi-ik [^\n]*$",
     re.M | re.S,
 )
-"""What a reader does next on a page."""
+"""Steps of a page that a reader takes in order."""
 
 INPUT = re.compile(r"\.(urdf|xml|xacro|npz|npy|pt|parquet|mcap|yaml|json|csv)$|/$")
 """Names of files that a command reads."""
 
 NOT_RUN = ("view", "follow", "completion")
-"""Commands that serve until they are stopped, or need a recording of a hand."""
+"""Commands that run until they are stopped, or need a recording of a hand."""
 
 
 def commands(text: str) -> Iterator[str]:
-    """Lines that begin with the program, continued ones joined."""
+    """Return the lines that start with the program, with their continuation lines."""
     for language, body in BLOCK.findall(text):
         if language in ("", "sh"):
             lines = body.replace("\\\n", " ").splitlines()
@@ -124,7 +124,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def save_files(page: Path, folder: Path) -> None:
-    """Blocks of YAML whose first line is their file's name, and the sets that a tool makes."""
+    """Write the YAML blocks whose first line is a file name, and the sets that a tool generates."""
     for language, body in BLOCK.findall(page.read_text(encoding="utf-8")):
         name = FILE_NAME.match(body)
         if language == "yaml" and name:
@@ -168,7 +168,7 @@ def test_wrong_commands_are_detected() -> None:
     ids=lambda path: path.stem,
 )
 def test_python_blocks_run(page: Path, folder: Path) -> None:
-    """Every block alone, or after the page's first one."""
+    """Every block runs alone, or after the first one of its page."""
     save_files(page, folder)
     first, *later_blocks = python_blocks(page)
     namespace: dict[str, Any] = {}
@@ -180,7 +180,7 @@ def test_python_blocks_run(page: Path, folder: Path) -> None:
 
 
 def grasps_shown() -> Iterator[tuple[str, dict[str, Any]]]:
-    """Every grasp in YAML on a page, in a docstring or in a help text, and where it stands."""
+    """Return every grasp in YAML on a page, in a docstring or in a help text, and its location."""
     for page in PAGES:
         for data in yaml_blocks(page.read_text()):
             kind = kind_of(data)
@@ -205,7 +205,7 @@ def test_every_grasp_on_the_pages_is_solved(tmp_path: Path) -> None:
 
 
 def without_pictures(words: list[str]) -> list[str]:
-    """Arguments without what is drawn: tests/views draws."""
+    """Return arguments without pictures, which tests/views covers."""
     words_left = list(words)
     for name in ("--picture", "--picture-dark", "--animation"):
         if name in words_left:
@@ -227,7 +227,7 @@ def missing(words: list[str]) -> bool:
 
 
 def gone_through(page: Path, folder: Path) -> list[str]:
-    """A page done from top to bottom; the commands that were run."""
+    """Run a page from top to bottom and return its commands."""
     save_files(page, folder)
     text, names, done = page.read_text(encoding="utf-8"), {}, []
     for match in STEP.finditer(text):
@@ -258,7 +258,7 @@ def gone_through(page: Path, folder: Path) -> list[str]:
     ],
 )
 def test_step_by_step_pages_run(page: str, count: int, folder: Path) -> None:
-    """Commands, Python and files in the order of the page, as one reader does it."""
+    """Commands, Python code and files run in the order of the page."""
     path = next(candidate for candidate in PAGES if candidate.stem == page)
     assert len(gone_through(path, folder)) >= count
 
@@ -272,7 +272,7 @@ def test_readme_is_short_and_correct(folder: Path) -> None:
 
 
 LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)|(?:src|srcset)=\"([^\"]+)\"")
-"""Targets of links and of pictures."""
+"""Targets of links and pictures."""
 
 PUBLISHED = {
     "https://casadi-ik.github.io/casadi_ik/": ".md",
@@ -283,7 +283,7 @@ PUBLISHED = {
 
 
 def test_links_of_the_readme_are_absolute_and_name_files_of_the_repository() -> None:
-    """Package indexes show the README without the files beside it."""
+    """Package indexes show only the README, so that its links are absolute."""
     targets = [a or b for a, b in LINK.findall(PAGES[0].read_text(encoding="utf-8"))]
     assert len(targets) > 20
     for target in targets:
@@ -303,7 +303,7 @@ def test_every_notebook_opens_in_colab() -> None:
 
 
 def test_pages_install_no_unpublished_package() -> None:
-    """Packages of this project are installed from a checkout until they are published."""
+    """Until the packages of this project are published, they are installed from a checkout."""
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         assert not re.search(r"(pip install|uv add|conda install) casadi-ik(-kernels)?\b", text), (

@@ -1,4 +1,4 @@
-"""Exported solvers: they compile without a word, solve bit for bit, and replace nothing else."""
+"""Exported solvers compile without warnings, give identical bits, and define no other symbols."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from casadi_ik.export.targets import SceneTargets, stored_targets
 LIBM = {"sin", "cos", "sincos", "pow", "fmod", "fmax", "fmin", "rint", "sqrt", "floor", "hypot"}
 LIBM |= {"frexp", "ldexp"}
 COMPILERS = {"memcpy", "memset", "memcmp", "memmove", "_GLOBAL_OFFSET_TABLE_"}
-"""What every C compiler may call of its own accord, without a C library too."""
+"""Functions that a C compiler may call by itself, also without a C library."""
 
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
 
 
 @pytest.fixture(scope="module")
 def project(robot, tmp_path_factory) -> Path:
-    """The project of the shipped robot, with a scene."""
+    """Project of the shipped robot with a scene."""
     out = tmp_path_factory.mktemp("exported") / "solver"
     write_folder(out, c_project(robot, "arm", 8))
     return out
@@ -41,7 +41,7 @@ def project(robot, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def plain_project(tmp_path_factory) -> Path:
-    """The project of a hand, without a scene."""
+    """Project of a hand without a scene."""
     out = tmp_path_factory.mktemp("exported") / "hand"
     write_folder(out, c_project(ik.load_robot("ar10"), "arm"))
     return out
@@ -145,7 +145,7 @@ def test_exported_body_keeps_clear_of_scene_and_itself(tmp_path, name):
     offsets = np.linalg.norm(robot.contacts(answers)[0] - points, axis=2)
     assert np.nanmax(offsets) < 5.001e-3
     assert np.isnan(offsets).sum() == len(points[::3])
-    # Or nothing was looked for.
+    # Otherwise nothing was checked.
     first = ik.Solver(robot).solve_batch(points, normals).q
     assert (~clear(first).free).sum() > 10
 
@@ -153,7 +153,7 @@ def test_exported_body_keeps_clear_of_scene_and_itself(tmp_path, name):
 @pytest.mark.slow
 @needs_gcc
 def test_exported_body_has_sides_and_trunk(tmp_path):
-    """A G1's answers, without a warning; the hands of each side are found in a file of its own."""
+    """A G1 compiles without a warning, and the hands of each side are in a file of their own."""
     write_folder(tmp_path, c_project(ik.load_robot("g1+dex3"), "g1"))
     assert (tmp_path / "src" / "g1_side_0.c").is_file()
     assert (tmp_path / "src" / "g1_side_1.c").is_file()
@@ -177,7 +177,7 @@ WINE = shutil.which("wine64") or shutil.which("wine64", path="/usr/lib/wine")
 def test_stored_targets_bit_for_bit_on_other_machines(
     plain_project, tmp_path, target, program, runner
 ):
-    """Emulated: apt-get install qemu-user, wine64."""
+    """Emulators run exports for other platforms: apt-get install qemu-user, wine64."""
     if runner is None:
         pytest.skip("no emulator")
     sources = [*sorted(plain_project.glob("src/*.c")), plain_project / "test" / "test.c"]
@@ -194,7 +194,7 @@ def test_stored_targets_bit_for_bit_on_other_machines(
 
 @pytest.mark.slow
 def test_exported_arms_avoid_the_scene(robot):
-    """Or the comparison of stored answers would say nothing of the choice among arms."""
+    """Otherwise the comparison of stored answers would not test the choice among arms."""
     solver = ik.Solver(robot)
     targets = SceneTargets(solver, 8)
     q_before = stored_targets(solver)[:200]
@@ -227,7 +227,7 @@ ODD = (np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-320, 1e-200, 1e-99, 1e30, 1e101, 1
 
 
 def malformed(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, ...]:
-    """Targets of which most hold a number that is none, or huge, or a wrong mix of free vectors."""
+    """Return targets of which most have a non-finite or huge number, or invalid free vectors."""
     rng = np.random.default_rng(0)
     q = robot.random(rng, count)
     (points, normals), q0 = robot.contacts(q), q + 0.01
@@ -236,7 +236,7 @@ def malformed(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, ...]:
             array = (points, normals, q0[:, None])[rng.integers(3)]
             vector = array[row, rng.integers(array.shape[1])]
             odd, is_whole_vector = rng.choice(ODD), rng.random() < 0.8
-            # Most others are out of reach, which takes long.
+            # Most of the others are out of reach, which takes long.
             index = (
                 slice(None) if is_whole_vector or np.isfinite(odd) else rng.integers(len(vector))
             )
@@ -299,7 +299,7 @@ int main(void) { /* how many solids, each: kind, size, pose; points, normals */
 @pytest.mark.slow
 @needs_gcc
 def test_other_hands_match_python(tmp_path):
-    """Grasps of the page, the object in the hand: C and Python look alike for what is free."""
+    """For grasps of the page with the object in the hand, C and Python find the same collisions."""
     page = runpy.run_path(str(Path(__file__).parents[2] / "page" / "build.py"))
     robot, out = ik.load_robot("panda+shadow"), tmp_path / "solver"
     words = ["export", "panda+shadow", "--prefix", "arm", "--scene", "8", "--out", str(out)]
@@ -488,7 +488,7 @@ def test_trigonometric_functions_are_accurate_to_the_last_place(tmp_path):
 
 @pytest.fixture(scope="module")
 def single_project(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The project of the shipped robot, with a scene."""
+    """Project of the shipped robot with a scene, in single precision."""
     out = tmp_path_factory.mktemp("single") / "solver"
     write_folder(out, c_project(robot, "arm", 8, single=True))
     return out
@@ -505,7 +505,7 @@ def test_single_precision_export_contains_no_double(single_project):
 @pytest.mark.slow
 @needs_gcc
 def test_single_precision_solutions_hold_in_double_precision(single_project):
-    """By its own test, under sanitizers; the long generated file without, which takes as long."""
+    """The test of the project passes under sanitizers, except for the long generated file."""
     other_lines = [
         f"src/{path.name}" for path in single_project.glob("src/*.c") if "_solve.c" not in path.name
     ]

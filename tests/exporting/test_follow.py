@@ -1,4 +1,4 @@
-"""Exported followers and palms: as in Python, and within limits whatever is asked."""
+"""Exported followers and palms equal Python, and keep limits for any input."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def stream(robot: ik.ArmHand, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Targets that move, leap, are out of reach, partly free, or none; and palms of some."""
+    """Return targets that move, jump, leave the reach, are partly free or invalid."""
     rng = np.random.default_rng(3)
     ends = np.clip(robot.home + rng.uniform(-0.2, 0.2, (6, 14)), robot.lower, robot.upper)
     part = np.linspace(0, 1, count // 5)[:, None]
@@ -137,7 +137,7 @@ def test_follower_matches_python_and_keeps_limits(robot, project):
 
 @needs_gcc
 def test_reachable_motion_is_followed_closely(robot, project):
-    """The motors stand still in the last second of four in which the target does."""
+    """The motors stand still in the last of four seconds, in which the target does."""
     program = built(project, "closely", FOLLOW_PROGRAM, "arm_follow", "-O1")
     second = round(1 / PERIOD)
     turn = np.append(np.linspace(0, 4, 500), np.full(4 * second, 4.0))[:, None, None]
@@ -254,7 +254,7 @@ int main(void) { /* q0, points, normals */
 
 @needs_gcc
 def test_joint_without_limits_is_continuous(tmp_path):
-    """A solver answers in the turn nearest to q0, and a follower turns on."""
+    """A solver answers in the turn nearest to q0, and a follower turns continuously."""
     source = on_pedestal(ik.load_robot("ur5e+panda_hand"), tmp_path, continuous=("ur5e_joint_1",))
     out = tmp_path / "solver"
     words = ["export", str(source.description.path), "--prefix", "arm", "--follow"]

@@ -1,4 +1,4 @@
-"""A cross-section of `studies/export_matrix.py`: grippers, tools and hands in every export mode."""
+"""Part of `studies/export_matrix.py`: grippers, tools and hands in every export mode."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from export_matrix import Cell, run_cell
 pytestmark = pytest.mark.slow
 
 COUNT = 50
-"""Targets per robot and mode: most of the time goes into compilation."""
+"""Targets per robot and mode; compilation takes most of the time."""
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc")
@@ -25,7 +25,7 @@ COUNT = 50
     ],
 )
 def test_exports_compile_without_warnings_and_answer_as_python(robot, mode):
-    """Under sanitizers, with warnings as errors."""
+    """Exports pass under sanitizers, with warnings as errors."""
     result = run_cell(Cell(robot, mode, COUNT))
     assert result["status"] == "pass", result["message"]
     solved = re.search(r"(\d+) solved", result["message"])

@@ -1,4 +1,4 @@
-"""The page: built, its module compared with Python in node, used by hand in Chromium."""
+"""The page: its module compared with Python in node, and its use by mouse and keys in Chromium."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def build(out: Path, module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         pytest.skip("the page needs npm and ziglang")
     assert "-O2" in project.COMMAND
     plainly = tuple("-O0" if word == "-O2" else word for word in project.COMMAND)
-    # Without optimisation zig guards the stack by a function that a browser does not have.
+    # Without optimisation zig protects the stack by a function that browsers lack.
     monkeypatch.setattr(project, "COMMAND", (*plainly, "-fno-stack-protector"))
     words = ["build", "--robots", ROBOT, BODY, "--out", str(out), "--keep", str(module)]
     monkeypatch.setattr(sys, "argv", words)
@@ -49,7 +49,7 @@ def build(out: Path, module: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def opened(browser: Browser, url: str, width: int, height: int, phone: bool = False) -> Page:
-    """The page, its first picture painted; then painting, which takes longest, is left out."""
+    """Open the page, paint its first picture, and then disable painting, which takes longest."""
     page = browser.open(url, width, height, phone)
     settled(page)
     assert page.complaints == []
@@ -66,12 +66,12 @@ def joint_positions(page: Page) -> np.ndarray:
 
 
 def settled(page: Page) -> None:
-    """Wait until all requests are done and the robot stands still."""
+    """Wait until all requests are answered and the robot stands still."""
     page.wait(f"{ANSWERED} && !casadiIk.viewport.framePending")
 
 
 def the_page_follows(page: Page, robot: ik.ArmHand) -> None:
-    """A contact is dragged: the fingertip that is drawn is there, by Python's kinematics."""
+    """A dragged contact moves the drawn fingertip as Python's kinematics does."""
     q_before = joint_positions(page)
     x, y = page.evaluate("casadiIk.pixel('point 0')")
     page.drag((x, y), (x + 9, y - 9), steps=4)
@@ -82,7 +82,7 @@ def the_page_follows(page: Page, robot: ik.ArmHand) -> None:
     q = np.array(page.evaluate("[...casadiIk.now.shown]"))
     points, _ = robot.contacts(q)
     assert np.linalg.norm(points - after, axis=1).max() <= 5.001e-3
-    # What is drawn are the shapes that distances are measured between, where Python has them.
+    # The drawn shapes are the collision shapes of Python.
     drawn_poses = page.evaluate(
         "casadiIk.now.body.parts.map(({ kind, at, mesh }) => [kind, at, mesh.position.toArray()])"
     )
@@ -120,7 +120,7 @@ def the_object_takes_its_contacts_along(page: Page) -> None:
 
 
 def steps_are_taken_back(page: Page) -> None:
-    """Keys move the object 5 mm up; undone, done again."""
+    """Keys move the object up by 5 mm; undo and redo work."""
     q_before = joint_positions(page)
     page.evaluate("document.getElementById('canvas').focus()")
     pressed(page, "Escape")
@@ -137,7 +137,7 @@ def steps_are_taken_back(page: Page) -> None:
 
 
 CONTROL, SHIFT = 2, 8
-"""As DevTools counts what is held."""
+"""Size of the heap according to DevTools."""
 
 
 def pressed(page: Page, key: str, duration: int = 0) -> None:
@@ -165,7 +165,7 @@ def the_answer_is_copied(page: Page) -> None:
 
 
 def a_link_has_the_question(page: Page, browser: Browser, url: str) -> None:
-    """A link restores the query; a broken link is reported as broken."""
+    """A link restores the request; a broken link is reported."""
     shown_expression = "[...casadiIk.now.shown]"
     page.evaluate("document.getElementById('reset').click()")
     pressed(page, "ArrowUp")
@@ -206,7 +206,7 @@ def out_of_reach_is_explained(page: Page) -> None:
 
 
 def an_obstacle_is_kept_clear_of(page: Page, robot: ik.ArmHand) -> None:
-    """Dragged into the arm: how far every answer is from touching, by Python's distances."""
+    """With an object dragged into the arm, the clearance of every answer equals Python's."""
     page.evaluate("document.getElementById('obstacle').click()")
     settled(page)
     goal = page.evaluate("casadiIk.pixel('point 0')")
@@ -260,7 +260,7 @@ def used_on_a_phone(page: Page) -> None:
 
 
 def two_hands_hold(page: Page) -> None:
-    """A robot of two arms is chosen: its six fingers differ, one hand moves and the other stays."""
+    """For a robot with two arms the contacts of one hand can be moved while the other stays."""
     robot = ik.load_robot(BODY)
     page.evaluate(f"document.querySelector('[data-robot=\"{BODY}\"]').click()")
     page.wait(f"casadiIk.now.robot?.name === '{BODY}' && {ANSWERED}")
@@ -291,7 +291,7 @@ def as_in_python(module: Path) -> None:
     assert (report["targets"], report["wrong"], report["refused"]) == (1000, 0, True)
 
 
-# One test, since building takes as long as all that is done with what was built.
+# This is a single test, since building takes as long as all that follows.
 def test_page_works_in_a_browser(
     tmp_path: Path,
     request: pytest.FixtureRequest,

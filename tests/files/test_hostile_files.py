@@ -1,4 +1,4 @@
-"""Files that nobody means well with: one short line, soon, whatever they hold."""
+"""Hostile files give one short line within a bounded time."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_output_equal_to_the_input_is_refused(tmp_path: Path) -> None:
 
 
 def npz(path: Path, shape: tuple[int, ...], data: bytes) -> Path:
-    """An npz whose arrays say they have a shape."""
+    """Write an npz file whose arrays claim a shape."""
     import io
     import zipfile
 
@@ -168,7 +168,7 @@ WORDS = st.sampled_from(
 
 
 def refused(load: Callable[[], object]) -> None:
-    """Call a reader; if it refuses, then by one short line."""
+    """Call a reader, and check that a refusal is one short line."""
     try:
         load()
     except ik.errors.CasadiIKError as error:

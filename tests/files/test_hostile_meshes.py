@@ -1,4 +1,4 @@
-"""Meshes that are broken, or larger than any robot's: a line each, and the process lives on."""
+"""Broken or oversized meshes give one line each, and do not crash the process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DAE = """<?xml version="1.0"?>
 <library_visual_scenes><visual_scene id="s"><node id="n"><translate>1 0 0</translate>
 <instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
 <scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
-"""In centimetres, moved by one; a corner is of no triangle, and there is no such material."""
+"""COLLADA file in centimetres with a translation, an unused corner and a missing material."""
 
 CORNERS = np.array([[0, 0, 0], [10, 0, 0], [0, 20, 0], [0, 0, 30]])
 
@@ -40,7 +40,7 @@ print("lived")
 
 
 def tetrahedron(folder: Path, kind: str) -> Path:
-    """A body of four corners [cm, or m], in one of the formats."""
+    """Write a tetrahedron [cm, or m] in one of the formats."""
     path = folder / f"body.{kind.removeprefix('ascii_')}"
     if kind == "dae":
         path.write_text(DAE.format(corners=" ".join(map(str, CORNERS.ravel()))))
@@ -59,7 +59,7 @@ KINDS = ("stl", "ascii_stl", "obj", "ply", "ascii_ply", "dae", "off", "glb")
 
 
 def scene(mesh: Path, scale: float = 0.01) -> Path:
-    """A scene of that mesh."""
+    """Write a scene with that mesh."""
     path = mesh.with_name(f"{mesh.name}.yaml")
     text = f"{{kind: mesh, file: {mesh.name}, scale: {scale}}}"
     path.write_text(f"name: one\nsolids: {{body: {text}}}\n")
@@ -80,7 +80,7 @@ SHARDS = (b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\0\0\xc0\x7f", b"nan", b"-
 
 
 def damaged(data: bytes, rng: random.Random) -> bytes:
-    """A file's bytes, of which some are lost, doubled, changed or said to be more."""
+    """Return a file's bytes, some of them deleted, repeated, or replaced by large numbers."""
     changed_data = bytearray(data)
     for _ in range(rng.choice((1, 2, 8))):
         i = rng.randrange(len(changed_data) + 1)

@@ -1,4 +1,4 @@
-"""The schemas that editors use say what the readers accept, no more and no less."""
+"""The schemas for editors accept what the readers accept, no more and no less."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def checker(kind: str) -> jsonschema.Draft7Validator:
 
 
 def reads(kind: str, data: Any) -> bool:
-    """Return the error of the reader for that kind of file, or ""."""
+    """Return the error of the reader for a kind of file, or ""."""
     type_ = file_type(data) if kind in ("robot", "body") else FILES[kind][0]
     try:
         validated(data, type_, Path("file"))
@@ -99,7 +99,7 @@ def loaded(path: Path) -> Any:
 
 
 def small(value: Any) -> Any:
-    """The same with one mapping of a list, and without shapes, which an example has."""
+    """Return the data with one mapping of a list, and without shapes, which an example has."""
     if isinstance(value, dict):
         return {key: small(item) for key, item in value.items() if key != "collision"}
     if isinstance(value, list):
@@ -119,7 +119,7 @@ def places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
 
 
 def changed(data: Any, path: tuple[Any, ...]) -> Iterator[Any]:
-    """The data with what stands at a place left out, renamed, or something else."""
+    """Return the data without the value at a path, with its key renamed, or with another value."""
     *parents, last = path
 
     def copied() -> tuple[Any, Any]:
@@ -136,7 +136,7 @@ def changed(data: Any, path: tuple[Any, ...]) -> Iterator[Any]:
         copied_data, inner = copied()
         inner[f"{last}_"] = inner.pop(last)
         yield copied_data
-    # In which unit a joint's limits are is a matter of its type, which a schema does not see.
+    # The unit of limits depends on the type of the joint, which a schema does not see.
     units = ("1 kg",) if {"limits", "velocity"} & {*path} else ("3 deg", "3 mm", "-3 mm", "1 kg")
     for replacement in ("some text", *units, 0.5, -0.5, None, [1, 2], {"some": "mapping"}):
         copied_data, inner = copied()
@@ -169,10 +169,10 @@ def test_shipped_files_validate(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", FILES)
 def test_schema_and_reader_agree(kind: str) -> None:
-    """Every key left out, misspelt, or with another value: both take it, or neither does."""
+    """For every key that is deleted, misspelt or changed, schema and reader agree."""
     examples = [EXAMPLES[kind]] if kind in EXAMPLES else []
     if kind in FOLDERS:
-        # In which unit a sliding joint's limits are is a matter of its type.
+        # The unit of limits depends on the type of the joint.
         turning = [path for path in shipped(kind) if "prismatic" not in path.read_text()]
         smallest = min(turning, key=lambda path: path.stat().st_size)
         examples.append(small(loaded(smallest)))

@@ -1,4 +1,4 @@
-"""Description files: units, keys, and what is said of a malformed one."""
+"""Description files: units, keys, and errors of malformed files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from casadi_ik.files.shipped import models_folder, resolve_description
 
 
 class Entry(Struct, frozen=True):
-    """A file with something of everything."""
+    """File with values of every type."""
 
     number: float = 0.0
     text: str = ""
@@ -98,7 +98,7 @@ def test_error_names_file_and_key(tmp_path, case):
         ("number: 1\nnumber: 2", ":2:1: not valid YAML: key 'number' appears twice"),
         ("named: {a: 1, a: 2}", ":1:15: not valid YAML: key 'a' appears twice"),
         ("named: {[1]: 2}", ":1:9: not valid YAML: found unhashable key"),
-        # Where the text ends: libyaml says at the start of the next line.
+        # libyaml reports the end of the text at the start of the next line.
         ("rows: [1, 2", ":(1:12|2:1): not valid YAML: .*expected ',' or '\\]'"),
         ("text: 2020-99-99", ": not valid YAML: month must be in 1..12"),
         ("rows: &rows [*rows]", ": nested too deeply"),

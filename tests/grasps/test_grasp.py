@@ -1,4 +1,4 @@
-"""Contacts, grasps and grasp files: what is accepted and what is refused."""
+"""Contacts, grasps and grasp files: accepted and refused values."""
 
 from __future__ import annotations
 

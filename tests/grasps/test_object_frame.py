@@ -1,4 +1,4 @@
-"""Grasps in the frame of an object that stands somewhere."""
+"""Grasps in the frame of a placed object."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import casadi_ik as ik
 from casadi_ik import model as grasps
 
 NAMES = [name for name in ik.shipped_names("objects") if name != "golf_ball"]
-"""Those that grasps are shipped for: a golf ball is too small for most hands."""
+"""Objects with shipped grasps; a golf ball is too small for most hands."""
 
 SHAPES: tuple[grasps.Shape, ...] = (
     grasps.Sphere(diameter=0.08, source="x"),
@@ -73,7 +73,7 @@ def test_shipped_object(name: str) -> None:
     ],
 )
 def test_published_dimensions(name: str, size: tuple[float, float, float]) -> None:
-    # The banana's tips are rounded, so its bounding box is met by the tube's own geometry.
+    # The tips of the banana are round, so that its bounding box follows the geometry of the tube.
     vertices, _ = grasps.load_object(name).mesh(256)
     np.testing.assert_allclose(
         np.ptp(vertices, axis=0), size, atol=3e-3 if name == "banana" else 5e-5
@@ -92,7 +92,7 @@ def test_normal_is_the_gradient_of_the_distance(shape: grasps.Shape, points: np.
         axis=1,
     )
     error = np.abs(gradient - shape.normal(points)).max(axis=1)
-    # Inside, the distance has ridges, where the difference straddles two faces.
+    # Inside, the distance has ridges, where the difference quotient straddles two faces.
     assert np.quantile(error, 0.98) < 1e-6
 
 
@@ -109,7 +109,7 @@ def test_distance_leads_to_the_surface(shape: grasps.Shape, points: np.ndarray) 
 @pytest.mark.parametrize("shape", SHAPES, ids=shape_id)
 def test_distance_is_the_distance_to_the_mesh(shape: grasps.Shape, points: np.ndarray) -> None:
     vertices, faces = shape.mesh(96)
-    # Points spread over every triangle; the nearest of them is within a spacing of the distance.
+    # The nearest of points spread over all triangles is within one spacing of the distance.
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     weights = [(i / 12, j / 12) for i in range(13) for j in range(13 - i)]
     cloud = np.concatenate([a + u * (b - a) + v * (c - a) for u, v in weights])

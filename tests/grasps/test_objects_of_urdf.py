@@ -1,4 +1,4 @@
-"""Objects whose file is a URDF, as the object sets of simulators have them."""
+"""Objects in URDF files, as in the object sets of simulators."""
 
 from __future__ import annotations
 

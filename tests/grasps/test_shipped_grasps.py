@@ -1,4 +1,4 @@
-"""Every shipped grasp, verified from the files alone, and solved."""
+"""Every shipped grasp is verified from its files alone, and solved."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from casadi_ik import model as grasps
 NAMES = ik.shipped_names("grasps")
 TOOLS = Path(__file__).resolve().parents[2] / "tools"
 PALM_SURFACE = 0.080
-"""Of the Barrett hand, above its base [m]."""
+"""Height of the palm of the Barrett hand above its base [m]."""
 
 
 @cache
@@ -27,7 +27,7 @@ def robot_of(name: str) -> ik.ArmHand:
 
 @cache
 def solver_of(name: str) -> ik.Solver:
-    """In the virtual machine: a dozen solves are not worth a compiler."""
+    """Return a solver in the virtual machine, because few solves do not justify a compiler."""
     return ik.Solver(robot_of(name), tolerance=ik.Tolerance(1e-6, 1e-6), compiled=False)
 
 
@@ -37,7 +37,7 @@ def solver_on_a_table(name: str) -> ik.Solver:
 
 
 def arrays(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals, of what the fingers that touch are made of, where they touch."""
+    """Return points and normals of the contacts of the touching fingers."""
     points, normals, *_ = grasp.arrays(tuple(grasp.contacts))
     balls = [contact.ball for contact in grasp.contacts.values()]
     pairs = zip(balls, normals, strict=True)
@@ -45,7 +45,7 @@ def arrays(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray]:
 
 
 def in_object(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray]:
-    """The same in the object's frame."""
+    """Return the contacts in the frame of the object."""
     assert grasp.object_pose is not None
     points, normals = arrays(grasp)
     rotation, origin = grasp.object_pose[:3, :3], grasp.object_pose[:3, 3]
@@ -53,7 +53,7 @@ def in_object(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray]:
 
 
 def posed(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The configuration with the hand as the file has it, points and normals of its fingers."""
+    """Return the configuration with the file's hand, and its fingers' points and normals."""
     robot = robot_of(grasp.robot)
     q = robot.home.copy()
     for actuator, value in grasp.posture.items():
@@ -74,7 +74,7 @@ def pads(grasp: ik.Grasp) -> tuple[np.ndarray, np.ndarray]:
 
 
 def displacement(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(4, 4) rigid motion that takes points, and directions as if fixed to them, nearest."""
+    """Return the rigid motion (4, 4) that best maps points, and directions fixed to them."""
     middle, end_middle = start.mean(axis=0), end.mean(axis=0)
     left, _, right = np.linalg.svd((start - middle).T @ (end - end_middle))
     turn = right.T @ np.diag([1, 1, np.linalg.det(right.T @ left.T)]) @ left.T
@@ -131,7 +131,7 @@ def test_posture_keeps_limits_and_reproduces_the_contacts(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_squeeze_stays_inside_friction_cones(name: str) -> None:
-    """Tensions along the lines between the contacts balance; the best of them is inside."""
+    """Forces along the lines between the contacts balance; the best of them is inside the cones."""
     grasp = ik.load_grasp(name)
     points, normals = arrays(grasp)
     three = len(points) == 3
@@ -146,7 +146,7 @@ def test_the_squeeze_stays_inside_friction_cones(name: str) -> None:
         forces[:, j] -= pull
     size = np.maximum(np.linalg.norm(forces, axis=2), 1e-12)
     best = ((forces * normals).sum(axis=2) / size).min(axis=1).max()
-    # Barrett's pads tilt towards the palm below 131 mm, the more the smaller the object.
+    # Below 131 mm the Barrett pads tilt towards the palm, more so for smaller objects.
     box = isinstance(grasps.load_object(grasp.object).shape, grasps.Box)
     barrett = grasp.robot == "kuka_lwr_barrett"
     max_force = (0.01 if box else 1.3) if barrett else 0.8 if grasp.robot == "baxter_ar10" else 2.0
@@ -183,14 +183,14 @@ def test_script_verifies_and_refuses_a_broken_file(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_slider_hand_script_reproduces_a_shipped_file(tmp_path: Path) -> None:
-    """To six digits: the optimiser may differ in the last ones from machine to machine."""
+    """Values agree to six digits, because the optimiser may differ between machines."""
     done = run("make_ar10_grasps.py", "--out", tmp_path, "--only", "golf_ball")
     assert (done.returncode, done.stderr) == (0, "")
     names = tmp_path / "ar10_golf_ball.yaml", "ar10_golf_ball"
     (points, normals), (shipped_points, shipped_normals) = (
         arrays(ik.load_grasp(name)) for name in names
     )
-    # Where the object stands is free: lengths and angles are compared.
+    # The place of the object is free: lengths and angles are compared.
     lines, shipped_lines = points - points[0], shipped_points - shipped_points[0]
     np.testing.assert_allclose(lines @ lines.T, shipped_lines @ shipped_lines.T, atol=1e-6)
     np.testing.assert_allclose(normals @ normals.T, shipped_normals @ shipped_normals.T, atol=1e-5)

@@ -1,4 +1,4 @@
-"""Adapters of other programs hold the robot while their tracker has lost the hand."""
+"""Adapters hold the robot while the tracker has lost the hand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOST_VALUES = {
 
 @pytest.fixture
 def lerobot(monkeypatch):
-    """The adapter for LeRobot, with stand-ins for what it imports where that is not installed."""
+    """Adapter for LeRobot, with stand-ins for missing imports."""
     types, processor = ModuleType("lerobot.configs.types"), ModuleType("lerobot.processor")
     for name in ("FeatureType", "PipelineFeatureType", "PolicyFeature"):
         setattr(types, name, SimpleNamespace)

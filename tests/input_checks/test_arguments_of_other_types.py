@@ -1,4 +1,4 @@
-"""Arguments of another type than expected are refused by name, not by a traceback."""
+"""Arguments of another type are refused by name, without a traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keypoints in orders of other data sets are recognised by the bones, and converted."""
+"""Orders of keypoints of other data sets are recognised by the lengths of bones, and converted."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ OTHER_ORDERS = [name for name in KEYPOINT_ORDERS if name != STANDARD_ORDER]
 
 
 def keypoint_frame(i: int = 0) -> np.ndarray:
-    """(21, 3) a hand that moves and bends, with noise of a millimetre."""
+    """Return a hand (21, 3) that moves and bends, with noise of a millimetre."""
     noise = np.random.default_rng(i).normal(0, 1e-3, (21, 3))
     return hand(0.2 + 0.05 * i, np.array([0.5, 0.01 * i, 0.9]), 0.1 * i) + noise
 
 
 def reordered(frames: np.ndarray, name: str) -> np.ndarray:
-    """Frames (..., 21, 3) in another order."""
+    """Return frames (..., 21, 3) in another order."""
     result = np.empty_like(frames)
     result[..., KEYPOINT_ORDERS[name], :] = frames
     return result
@@ -51,7 +51,7 @@ def config(tmp_path_factory):
     st.booleans(),
 )
 def test_every_order_is_recognised_in_one_frame(name, bend, size, seed, mirrored):
-    """Whatever the posture, the size and the place, with noise of a millimetre."""
+    """Orders are recognised for any posture, size and place, with noise of a millimetre."""
     rng = np.random.default_rng(seed)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn = turn @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0])

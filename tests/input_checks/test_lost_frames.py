@@ -1,4 +1,4 @@
-"""Frames of a tracker that has lost the hand are held, in every loop and in recordings."""
+"""Frames in which the tracker has lost the hand are held, in every loop and in recordings."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ KEYS = {"thumb": 4, "finger_2": 8, "finger_3": 12}
 
 
 def keypoints(i: int = 0) -> np.ndarray:
-    """(21, 3) keypoints of a hand a metre away that moves slowly."""
+    """Return keypoints (21, 3) of a hand at a distance of one metre that moves slowly."""
     return hand(0.4, np.array([0.6, -0.3 + 0.002 * i, 0.9]))
 
 
 def with_key(key: int, place: np.ndarray) -> np.ndarray:
-    """(21, 3) the same hand with one keypoint elsewhere."""
+    """Return keypoints (21, 3) of the same hand with one keypoint elsewhere."""
     frame = keypoints()
     frame[key] = place
     return frame
@@ -44,7 +44,7 @@ ODD = {
     "a tip half a metre away": with_key(12, keypoints()[12] + [0.3, 0.4, 0.0]),
     "a hand that jumps": keypoints() + np.array([1.0, 0.0, 0.0]),
 }
-"""What only other frames tell."""
+"""Faults that only a comparison with other frames shows."""
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def solver(robot):
 @pytest.mark.parametrize("name", LOST_FRAMES)
 @pytest.mark.parametrize("first", [True, False])
 def test_lost_hand_is_held(robot, solver, config, name, first):
-    """Good frames give what they give without the lost one."""
+    """Valid frames give the same targets with and without the lost one."""
     retargeter, plain = (ik.motion.Retargeter(config, robot) for _ in range(2))
     follower = solver.follow(robot.home, period=1 / 30)
     if not first:
@@ -143,7 +143,7 @@ def test_lost_contacts_are_held_by_a_follower(robot, solver, number):
 
 
 def test_a_recording_with_lost_frames_is_followed(robot, tmp_path, capsys):
-    """Frames between which the hand was lost are not mixed with it."""
+    """Frames on both sides of a gap are not blended with it."""
     frames = np.array([keypoints(i) for i in range(30)])
     for i, lost_frame in enumerate((*LOST_FRAMES.values(), *ODD.values())):
         frames[2 * i + (i > 0)] = lost_frame
@@ -154,7 +154,7 @@ def test_a_recording_with_lost_frames_is_followed(robot, tmp_path, capsys):
     assert f"{len(LOST_FRAMES) + len(ODD)} of 30" in " ".join(capsys.readouterr().out.split())
     motion = np.load(out)
     assert {"holding"} < set(motion["status"][1:])
-    # The hand moves by 2 mm a frame: nothing of the robot goes farther than that asks for.
+    # The hand moves by 2 mm per frame, and no part of the robot moves farther than that requires.
     tips = robot.contacts(motion["q"])[0]
     assert np.linalg.norm(tips[-1] - tips[0], axis=1).max() < 0.3
 

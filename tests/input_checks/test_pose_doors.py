@@ -30,14 +30,14 @@ robot_of = cache(ik.load_robot)
 
 
 def pose_of(matrix: Array) -> Array:
-    """(4, 4) pose of a matrix (3, 3)."""
+    """Return the pose (4, 4) of a rotation matrix."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = matrix, POINT
     return pose
 
 
 def frame_of(contact: ik.Contact) -> Array:
-    """(3, 3) axes of a contact's frame."""
+    """Return the axes (3, 3) of the frame of a contact."""
     assert contact.normal is not None
     assert contact.tangent is not None
     return np.stack(
@@ -46,14 +46,14 @@ def frame_of(contact: ik.Contact) -> Array:
 
 
 def turned_palm(pose: Any) -> Array:
-    """(3, 3) of a grasp's palm."""
+    """Return the rotation (3, 3) of the palm of a grasp."""
     palm = ik.Grasp(palm=pose, posture={"bh_spread": 0.1}).single_palm
     assert palm is not None
     return palm[:3, :3]
 
 
 def scene_file(text: str) -> Array:
-    """(3, 3) of the solid of a scene file."""
+    """Return the rotation (3, 3) of the solid of a scene file."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "scene.yaml"
         path.write_text(text)
@@ -61,7 +61,7 @@ def scene_file(text: str) -> Array:
 
 
 def palm_of_data_set(matrix: Array) -> Array:
-    """(3, 3) of the palm that a data set of matrices gives."""
+    """Return the rotation (3, 3) of the palm of a data set of matrices."""
     row = {
         "trans": POINT[None],
         "rot": matrix[None],
@@ -78,7 +78,7 @@ def palm_of_data_set(matrix: Array) -> Array:
 
 @cache
 def frame_of_data_set() -> Array:
-    """(3, 3) the palm where the data set has the identity."""
+    """Return the rotation (3, 3) of the palm where the data set has the identity."""
     return palm_of_data_set(np.eye(3))
 
 
@@ -105,11 +105,11 @@ MATRICES: dict[str, Callable[[Array], Array]] = {
     ),
     "data set": lambda R: palm_of_data_set(R) @ frame_of_data_set().T,
 }
-"""Entrances for matrices: what they make of one (3, 3)."""
+"""Entrances for matrices: the rotation that each makes of a matrix (3, 3)."""
 
 
 def measurement(wxyz: Array) -> Array:
-    """(3, 3) of a measured fingertip."""
+    """Return the rotation (3, 3) of a measured fingertip."""
     values = ",".join(map(str, (0.0485, 0.0512, *POINT, *wxyz)))
     head = "finger,index_proximal_slider,index_middle_slider,x,y,z,qw,qx,qy,qz\n"
     with TemporaryDirectory() as folder:
@@ -120,7 +120,7 @@ def measurement(wxyz: Array) -> Array:
 
 
 def table(wxyz: Array) -> Array:
-    """(3, 3) of a palm in a table."""
+    """Return the rotation (3, 3) of a palm in a table."""
     robot = robot_of(ALLEGRO)
     columns = dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), (*POINT, *wxyz), strict=True))
     columns |= dict.fromkeys(robot.description.finger_motors, 0.3)
@@ -149,7 +149,7 @@ QUATERNIONS: dict[str, Callable[[Array], Array]] = {
 
 
 def matrix_of(wxyz: Array) -> Array:
-    """(3, 3) rotation of a quaternion of any length."""
+    """Return the rotation (3, 3) of a quaternion of any length."""
     w, x, y, z = wxyz / np.linalg.norm(wxyz)
     return np.array(
         [
@@ -161,12 +161,12 @@ def matrix_of(wxyz: Array) -> Array:
 
 
 def angle_between(first: Array, second: Array) -> float:
-    """Angle between two rotations [deg]."""
+    """Return the angle between two rotations [deg]."""
     return float(np.rad2deg(np.linalg.norm(first - second) / np.sqrt(2)))
 
 
 FEW = settings(max_examples=15)
-"""Each example goes through all entrances, some of which read files."""
+"""Settings: each example goes through all entrances, some of which read files."""
 
 numbers = st.floats(-1, 1, allow_nan=False, allow_subnormal=False)
 unit = (
@@ -200,7 +200,7 @@ def test_rounded_quaternions_are_taken_at_every_entrance(wxyz, decimals):
 @FEW
 @given(unit, unit, st.floats(MAX_SKEW * 1.01, 10.0), st.booleans())
 def test_the_limit_is_the_same_at_every_entrance(wxyz, other_axis, skew, mirrored):
-    """A stretched or a mirrored rotation is refused: the largest entry of |R^T R - I| counts."""
+    """Stretched and mirrored rotations are refused by the largest entry of |R^T R - I|."""
     stretch = np.diag([1.0, 1.0, np.sqrt(1 + skew)])
     matrix = matrix_of(wxyz) @ stretch
     if mirrored:
@@ -228,7 +228,7 @@ def test_a_tangent_that_is_not_across_the_normal_is_refused():
 
 
 def test_rounded_half_square_roots_are_accepted():
-    """Rotations with four decimals, as people type them, are accepted."""
+    """Rotations with four decimals are accepted."""
     turn = [[0.7071, -0.7071, 0, 0.5], [0.7071, 0.7071, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]]
     c = np.sqrt(0.5)
     rotation = scene_file(yaml.safe_dump({"solids": {"a": BOX | {"pose": turn}}}))
@@ -237,7 +237,7 @@ def test_rounded_half_square_roots_are_accepted():
 
 @pytest.fixture(scope="module")
 def setting(robot):
-    """A solver with a scene, and what is asked of it."""
+    """Solver with a scene, and its arguments."""
     scene = ik.Scene({"a": BOX | {"xyz": [0.9, 0.9, 0.9]}}, grasped="a")
     grasp = ik.load_grasp("cup")
     points, normals = grasp.arrays(robot.fingers)

@@ -1,4 +1,4 @@
-"""Times in other units than seconds are refused at once, with their likely unit."""
+"""Times in other units than seconds are refused with their likely unit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ UNITS = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
 
 
 def follow(folder, capsys, **arrays):
-    """Exit code and errors of following a recording."""
+    """Return exit code and errors of following a recording."""
     path = folder / "frames.npz"
     np.savez(path, **arrays)
     words = ["follow", path, "--robot", "kuka_lwr_barrett", "--period", "0.05"]

@@ -15,7 +15,7 @@ WALL = {"kind": "box", "size": [2.0, 0.02, 2.0], "xyz": [0.6, 0.5, 0.5]}
 
 
 def scaled(entry, factor):
-    """A solid of a scene with its lengths in other units."""
+    """Return a solid of a scene with lengths in other units."""
     lengths = {"size", "radius", "length", "xyz", "points"}
     return {k: (factor * np.array(v)).tolist() if k in lengths else v for k, v in entry.items()}
 

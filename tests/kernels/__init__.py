@@ -1,1 +1,1 @@
-"""Tests of the kernels: what is compiled equals what is not."""
+"""Tests of the kernels: compiled code equals the virtual machine."""

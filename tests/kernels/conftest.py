@@ -1,4 +1,4 @@
-"""Every kernel test builds into a cache of its own session."""
+"""Every kernel test builds into a cache of its session."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def session_cache(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(autouse=True)
 def own_cache(session_cache: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Tests share one cache, apart from the user's and from tests of the cache itself."""
+    """Use one cache for the tests, apart from that of the user."""
     monkeypatch.setenv("CASADI_IK_CACHE", session_cache)
     monkeypatch.delenv("CASADI_IK_CFLAGS", raising=False)
 

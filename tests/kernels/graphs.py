@@ -1,4 +1,4 @@
-"""Steps and functions that the kernel tests share."""
+"""Steps and functions for the kernel tests."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def random_step(seed: int = 0, turning: bool = True) -> StepGraph:
     x, p = ca.SX.sym("x", 4), ca.SX.sym("p", 2)
     noise = random_expression(ca.vertcat(x, p), 4, 120, seed, turning)
     mixed = 3 * noise + 4 * x
-    # A parabola of the rest folds as a sine does.
+    # A parabola of the remainder folds like a sine.
     remainder = mixed - 2 * ca.floor(mixed / 2 + 0.5)
     new = 2 * ca.sin(mixed) if turning else 2 - 4 * remainder * remainder
     status = ca.if_else(ca.fabs(new[0] - p[1]) < 0.01, DONE, RUNNING)
@@ -88,7 +88,7 @@ def random_step(seed: int = 0, turning: bool = True) -> StepGraph:
 
 
 def branching_step() -> StepGraph:
-    """An MX step whose branches are short-circuited calls."""
+    """Return an MX step whose branches are short-circuited calls."""
     x, p = ca.SX.sym("x", 4), ca.SX.sym("p", 2)
     left = ca.Function("left", [x, p], [ca.sin(3 * x) * p[0], record_of(x, p)])
     right = ca.Function("right", [x, p], [ca.sqrt(1 + x * x) - 2 * ca.cos(x), record_of(-x, p)])
@@ -104,7 +104,7 @@ COUNT = Layout.record(Field("count"))
 
 
 def counting_step(name: str = "counting", offset: float = 0.0) -> StepGraph:
-    """Counts up by one and ends (`DONE`) at the parameter."""
+    """Return a step that counts by one and ends (`DONE`) at the parameter."""
     x, p = ca.SX.sym("x"), ca.SX.sym("p")
     new = x + 1
     status = ca.if_else(new >= p, DONE, RUNNING)
@@ -113,7 +113,7 @@ def counting_step(name: str = "counting", offset: float = 0.0) -> StepGraph:
 
 
 def circling_step(name: str = "circling") -> StepGraph:
-    """Counts from 0 up to the parameter, then backwards by three, and so on; it never ends."""
+    """Return a step that counts to the parameter, then by three backwards, and never ends."""
     x, p = ca.SX.sym("x"), ca.SX.sym("p")
     new = ca.if_else(x >= p, x - 3, x + 1)
     function = ca.Function(name, [x, p], [new, new, ca.SX(RUNNING)])

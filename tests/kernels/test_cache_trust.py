@@ -33,10 +33,10 @@ def give_away(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         return
     theirs, owner_check = path.lstat().st_ino, cache._others
 
-    def foreign_owner(found: os.stat_result, sticky: bool) -> str:
-        if found.st_ino == theirs:
-            found = os.stat_result((*found[:4], SOMEBODY, *found[5:10]))
-        return owner_check(found, sticky)
+    def foreign_owner(status: os.stat_result, sticky: bool) -> str:
+        if status.st_ino == theirs:
+            status = os.stat_result((*status[:4], SOMEBODY, *status[5:10]))
+        return owner_check(status, sticky)
 
     monkeypatch.setattr(cache, "_others", foreign_owner)
 
@@ -124,7 +124,7 @@ def test_cache_directory(monkeypatch, tmp_path):
 
 @POSIX
 def test_cache_folders_are_private(directory, monkeypatch):
-    """The umask does not matter; a parent folder may be sticky."""
+    """The result is independent of the umask; a parent folder may be sticky."""
     monkeypatch.setenv("CASADI_IK_CACHE", str(directory / "a"))
     mask_before = os.umask(0)
     try:

@@ -1,4 +1,4 @@
-"""A compiler in a folder whose name has a blank."""
+"""A compiler in a folder with a blank in its name works."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_path_with_a_blank_has_to_be_quoted(
     with pytest.warns(compiler.NoCompilerWarning) as caught:
         compiler.warn_no_compiler()
     advice = str(caught[0].message)
-    # What is advised works as it stands.
+    # The advice of the message works.
     quoted = advice.partition('CC="')[2].partition('"')[0]
     assert str(program) in quoted
     monkeypatch.setitem(os.environ, "CC", f"{quoted}{options}")

@@ -1,4 +1,4 @@
-"""Functions called as C: shapes, batches, elementary functions of our own, nearest rows."""
+"""Functions called as C: shapes, batches, elementary functions, nearest rows."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .graphs import BOTH, needs_compiler, random_expression
 
 
 def matrices(kind: Any) -> ca.Function:
-    """Scalar, vector and matrix inputs; matrix, sparse, row and scalar outputs."""
+    """Return a function with scalar, vector, matrix, sparse and row arguments or results."""
     a, v, m = kind.sym("a"), kind.sym("v", 3), kind.sym("m", 2, 3)
     sparse = ca.diag(v)
     outputs = [a * m, sparse, m @ v, (m @ v).T, ca.sum1(v)]
@@ -46,7 +46,7 @@ def test_matrices_are_row_major(compiled, kind):
         assert result.flags.c_contiguous
         assert result.shape == np.shape(expected_result)
         np.testing.assert_allclose(result, expected_result, rtol=1e-14, atol=1e-14)
-    # Column-major input and lists are the same numbers.
+    # Column-major input and lists give the same numbers.
     for result, expected_result in zip(
         kernel(a, v.tolist(), np.asfortranarray(m)), results, strict=True
     ):
@@ -56,7 +56,7 @@ def test_matrices_are_row_major(compiled, kind):
 @needs_compiler
 @pytest.mark.parametrize("in_lanes", [False, True])
 def test_subfunctions_are_called_or_inlined(in_lanes, rng):
-    """Neighbours in memory, results of another part, comparisons, and a result nobody asks for."""
+    """Arguments are adjacent in memory, other results or comparisons; a result is unused."""
     x, w = ca.SX.sym("x", 3), ca.SX.sym("w", 2)
     inner = call_function("inner", [x, w], [2 * ca.sin(x) + w[0], ca.sumsqr(x) * w[1]])
     y, z = ca.SX.sym("y", 3), ca.SX.sym("z", 4)
@@ -102,7 +102,7 @@ def test_unaligned_numbers(compiled):
 
 @needs_compiler
 def test_pauses_for_signals_change_nothing():
-    """A call of more than half a second, which returns to Python every 0.2 s."""
+    """A call of more than half a second returns to Python every 0.2 s."""
     x = ca.SX.sym("x")
     y, points = x, np.linspace(0, 3, 300_000)
     for _ in range(100):
@@ -194,7 +194,7 @@ def compare(functions: tuple[FunctionKernel, FunctionKernel], points: np.ndarray
         expected = [getattr(np, name.replace("a", "arc", 1) if name[0] == "a" else name)(x)
                     for name in OF_ONE]  # fmt: skip
         expected.append(np.arctan2(y, x))
-        # Next to a multiple of pi the last places of a sine are those of pi.
+        # Near a multiple of pi the last digits of a sine are those of pi.
         off = np.abs(values - np.stack(expected, axis=1)) - 1e-22
         units = off / np.spacing(np.abs(expected)).T
     assert (np.isnan(values) == np.isnan(np.stack(expected, axis=1))).all()
@@ -247,11 +247,11 @@ def test_sample_counts_of_special_functions(functions, x, y):
 
 
 COUNT = 7
-"""Numbers: more than go into one call of an elementary function, and one left over."""
+"""Numbers: more than one call of an elementary function takes, with a remainder."""
 
 
 def agree(function: ca.Function, samples: np.ndarray, rtol: float = 1e-13) -> np.ndarray:
-    """Values of a function of one vector: compiled, side by side and in the virtual machine."""
+    """Return the values of a function, equal in scalar code, lanes and virtual machine."""
     (values,) = FunctionKernel(function)(samples)
     (expected,) = FunctionKernel(function, compiled=False)(samples)
     (beside,) = FunctionKernel(function, in_lanes=True)(samples)
@@ -268,7 +268,7 @@ def test_straight_lines(seed):
 
 
 def test_calls_and_branches():
-    """Arguments that are parts, transposed, constant or left out; branches within branches."""
+    """Arguments are parts, transposed, constant or left out; branches are nested."""
     x, y, m = ca.SX.sym("x", 3), ca.SX.sym("y"), ca.SX.sym("m", 2, 3)
     cases = [
         ca.Function(f"case_{i}", [x, y, m], [x * (i + 1) + y, m @ ca.sin(x), ca.SX(i)])
@@ -288,7 +288,7 @@ def test_calls_and_branches():
 
 
 def test_tables():
-    """The nearest row of a table, of equal ones the first."""
+    """The nearest row of a table is found; of equal ones it is the first."""
     table = np.random.default_rng(1).normal(size=(40, 3))
     table[7] = table[30]
     x = ca.MX.sym("x", 3)
@@ -306,7 +306,7 @@ def test_tables():
 
 @pytest.mark.parametrize("scale", [1e-9, 0.5, 3.0, 1e9])
 def test_elementary_functions_computed_together(scale):
-    """The bits of one call each."""
+    """Elementary functions computed together give the bits of single calls."""
     x = ca.SX.sym("x", COUNT)
     arcs = [ca.atan2(x, x[0]), ca.asin(x[:5]), ca.acos(x), ca.atan(x)]
     values = ca.vertcat(ca.sin(x), ca.cos(x[:3]), *arcs)
@@ -370,7 +370,7 @@ def test_functions_without_c_code_are_named():
         FunctionKernel(function)
 
 
-# Nearest rows, against plain sorting: with ties, unknown entries and odd table sizes.
+# Nearest rows compared with sorting: with ties, unknown entries and odd table sizes.
 
 
 def identity(size: int) -> ca.Function:
@@ -379,7 +379,7 @@ def identity(size: int) -> ca.Function:
 
 
 def sorted_rows(table, keys, count):
-    """Exact integers and a stable sort."""
+    """Return the nearest rows by exact integers and a stable sort."""
     rounded = [
         np.rint(x * STEPS_PER_UNIT).clip(-MAX_STEPS, MAX_STEPS)
         for x in (table, np.nan_to_num(keys))
@@ -392,7 +392,7 @@ def sorted_rows(table, keys, count):
 @BOTH
 @pytest.mark.parametrize(("rows", "size"), [(1, 2), (16, 3), (37, 2), (300, 7)])
 def test_nearest_in_order(compiled, rows, size, rng):
-    """Coarse entries, so that many rows are equally near."""
+    """Coarse entries make many rows equally near."""
     table, keys = rng.integers(-9, 10, (rows, size)) / 4, rng.normal(size=(40, size)) * 3
     keys[::3, 0] = np.nan
     keys[5] = 100.0

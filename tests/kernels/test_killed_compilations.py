@@ -1,4 +1,4 @@
-"""Compilations that are interrupted or killed, and forks during a build."""
+"""Interrupted and killed compilations, and forks during a build."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .library_cases import POSIX, age, kernel, lie, scaled, script, works
 
 
 class Pressed:
-    """A value that raises SIGINT while CasADi converts it."""
+    """Value that raises SIGINT while CasADi converts it."""
 
     def __SX__(self) -> ca.SX:
         signal.raise_signal(signal.SIGINT)
@@ -53,7 +53,7 @@ def test_ctrl_c_leaves_no_files(directory, monkeypatch, moment):
 
 @needs_compiler
 def test_leftovers_of_killed_compilations_are_removed(directory):
-    """Leftovers of dead processes go after an hour, of unknown ones after a day."""
+    """Leftovers of dead processes are removed after an hour, of unknown ones after a day."""
     ended_process = subprocess.Popen(["true"])
     ended_process.wait()
     directory.mkdir(mode=0o700)

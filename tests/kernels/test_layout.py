@@ -1,4 +1,4 @@
-"""Layouts of vectors, and the rows of records that they are stored in."""
+"""Layouts of vectors, and the rows in which records are stored."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def layouts(draw: st.DrawFn) -> Layout:
 
 
 def numbers(layout: Layout, lead: tuple[int, ...] = ()) -> dict[str, Any]:
-    """A different number in every place."""
+    """Return a layout's values, all different."""
     flat = np.arange(layout.size * int(np.prod(lead, dtype=int))) + 0.5
     return layout.unpack(flat.reshape(*lead, layout.size))
 
@@ -109,7 +109,7 @@ def test_step_whose_sizes_disagree_is_refused():
         StepGraph("wrong", function, two, scalar_layout, scalar_layout)
 
 
-# Double, and what it has to become in u1, u4 and i4.
+# A double, and its values as u1, u4 and i4.
 CASES = [
     (0.0, 0, 0, 0),
     (-0.0, 0, 0, 0),
@@ -154,7 +154,7 @@ def test_numpy_conversion():
 
 @BOTH
 def test_loop_conversion(compiled):
-    """Every storage type, every awkward double, at offsets that are not aligned."""
+    """Every storage type stores special doubles correctly at unaligned offsets."""
     layout = Layout.record(*LAYOUT, Field("odd", (2,), "u1"))
     x, p = ca.SX.sym("x"), ca.SX.sym("p", len(CASES))
     function = ca.Function("awkward", [x, p], [x + 1, ca.vertcat(*[p] * 5, 1, 2), 0])

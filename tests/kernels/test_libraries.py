@@ -64,10 +64,10 @@ def test_broken_library_is_rebuilt(directory, monkeypatch, damage):
     assert works()
     (path,) = cached_files(directory, ".so")
     data = path.read_bytes()
-    # Never written in place: this process has the file mapped.
+    # The file is not changed in place, because this process has mapped it.
     path.unlink()
     if damage == "other library":
-        # A whole and loadable file under a name that fits its bytes, but of another driver.
+        # A valid library under a name that fits its bytes, but of another driver.
         LoopKernel(counting_step("other"))
         (other_library,) = [
             cached_file
@@ -266,7 +266,7 @@ def test_faulty_compilers_are_reported(directory, monkeypatch, property_name, ex
 @pytest.mark.parametrize("waits", [True, False])
 @pytest.mark.parametrize("size", [10, 10**6])
 def test_a_long_compilation_is_announced(directory, monkeypatch, terminal, waits, size):
-    """Through a pseudo-terminal or a pipe; in a pipe not to those who asked to wait."""
+    """The announcement appears in a terminal; in a pipe only without CASADI_IK_COMPILE=wait."""
     monkeypatch.setenv("CASADI_IK_COMPILE", "wait" if waits else "background")
     read, write = os.openpty() if terminal else os.pipe()
     with os.fdopen(write, "w") as stream:

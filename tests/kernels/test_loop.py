@@ -1,4 +1,4 @@
-"""The loop: the same in C and in the VM, every way to end, every record."""
+"""The loop is the same in C and in the virtual machine: all ends, all records."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_compiled_loop_equals_vm_bit_for_bit(step):
     states, parameters = starts(6)
     fast = kernel.run(states, parameters, 400, trace=True)
     assert_same(fast, vm.run(states, parameters, 400, trace=True))
-    # Not vacuous: the solves move, and end at different iterations.
+    # The solves move and end at different iterations.
     assert len(np.unique(fast.iterations)) > 2
     assert np.unique(fast.states).size > 12
     assert fast.states.dtype == np.float64
@@ -79,7 +79,7 @@ def test_compiled_loop_equals_vm_bit_for_bit(step):
 @needs_compiler
 @pytest.mark.parametrize("step", [random_step(0), random_step(1), branching_step()])
 def test_compiled_step_equals_vm_but_for_the_last_places(step):
-    """Compiled code has sines of its own; chaotic steps would make much of it when iterated."""
+    """Compiled code has its own sine, whose rounding chaotic steps would amplify when iterated."""
     kernel, vm = LoopKernel(step), LoopKernel(step, compiled=False)
     states, parameters = starts(200)
     fast = kernel.run(states, parameters, 1, trace=True)
@@ -124,7 +124,7 @@ def test_repeated_state_ends_the_solve(compiled):
     result = kernel.run([[0.0], [20.0], [1e9]], [20], 100)
     assert result.status.tolist() == [REPEATED, REPEATED, RUNNING]
     assert result.iterations.tolist() == [36, 20, 100]
-    # Cut into pieces by the clock or by a full trace it is the same.
+    # Interruptions by the clock or by a full trace change nothing.
     traced = kernel.run(np.zeros((3, 1)), [[3], [300], [900]], 10_000, trace=True)
     assert traced.iterations.tolist() == [20, 516, 1028]
 
@@ -135,7 +135,7 @@ def test_parameters_for_all_or_for_each(compiled):
     shared = kernel.run(np.arange(10.0)[:, None], [50], 60)
     assert shared.iterations.tolist() == (50 - np.arange(10)).tolist()
     assert (shared.time > 0).all()
-    # Views with strides and other number types are taken as they come.
+    # Strided views and other number types are accepted.
     strided = np.arange(12, dtype=np.int32).reshape(6, 2)[::3, 1:]
     assert kernel.run(np.zeros((2, 1)), strided, 10).iterations.tolist() == [1, 7]
 
@@ -168,7 +168,7 @@ def test_traces_longer_than_the_first_block(compiled):
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_non_finite_state_ends_the_loop(compiled, bad):
     x, p = ca.SX.sym("x", 2), ca.SX.sym("p")
-    # One element only becomes bad, and the step claims to have ended well.
+    # Only one element becomes non-finite, and the step reports a normal end.
     new = ca.vertcat(x[0] + 1, ca.if_else(x[0] >= 2, p, x[1]))
     done = ca.if_else(x[0] >= 2, DONE, RUNNING)
     step = step_of("spoiled", ca.Function("spoiled", [x, p], [new, x[0], done]), COUNT)
@@ -279,7 +279,7 @@ def test_threads_share_a_kernel(compiled):
 
 @needs_compiler
 def test_pauses_for_signals_change_nothing():
-    """Runs of more than half a second, which return to Python every 0.2 s."""
+    """Runs of more than half a second return to Python every 0.2 s."""
     kernel, count = LoopKernel(counting_step()), 50_000_000
     assert kernel.run(np.zeros((1, 1)), [float(count)], 10**9).iterations.tolist() == [count]
 
@@ -310,12 +310,12 @@ def test_keyboard_interrupt_reaches_a_compiled_loop():
 pytestmark = needs_compiler
 
 COUNTS = (MIN_SOLVES_IN_LANES, 9, 2 * SLOTS + 3)
-"""Solves in a batch: fewer than lanes, one that must wait, many more than are under way at once."""
+"""Numbers of solves in a batch: fewer than lanes, one that must wait, many more than slots."""
 
 
 @pytest.fixture(params=[4, 8])
 def lanes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
-    """Both widths, where the machine has them."""
+    """Number of lanes: both widths, where the machine has them."""
     if machine_lanes() < request.param:
         pytest.skip(f"this machine has {machine_lanes()} lanes")
     monkeypatch.setenv("CASADI_IK_LANES", str(request.param))
@@ -328,7 +328,7 @@ LANES = pytest.mark.usefixtures("lanes")
 def assert_as_alone(
     step: StepGraph, states: np.ndarray, parameters: np.ndarray, budget: int
 ) -> LoopResult:
-    """The result, once it is known to be that of each solve alone."""
+    """Return the result of a batch after checking that it is that of single solves."""
     kernel = LoopKernel(step)
     assert kernel.lanes > 1
     batch_run = kernel.run(states, parameters, budget, trace=True)
@@ -356,12 +356,12 @@ def test_lanes_match_single_solves(step, count):
     rng = np.random.default_rng(count)
     states, parameters = rng.normal(size=(count, 4)), rng.normal(size=(count, 2))
     batch_run = assert_as_alone(step, states, parameters, 300)
-    # Not vacuous: solves end at different iterations.
+    # Solves end at different iterations.
     assert count < COUNTS[-1] or len(np.unique(batch_run.iterations)) > 2
 
 
 def staged_step(stages: int) -> StepGraph:
-    """Goes through its stages by chance, each with an arithmetic of its own."""
+    """Return a step that moves at random through stages with different arithmetic."""
     x, stage, p = ca.SX.sym("x"), ca.SX.sym("stage"), ca.SX.sym("p")
     cases = [
         ca.Function(f"case_{i}", [x, p], [ca.sin((3 + i) * x + p) * 2 + i / 7])
@@ -369,7 +369,7 @@ def staged_step(stages: int) -> StepGraph:
     ]
     xm, sm, pm = ca.MX.sym("x"), ca.MX.sym("stage"), ca.MX.sym("p")
     new = ca.Function.conditional("choose", cases[:-1], cases[-1])(sm, xm, pm)
-    # The digits up to the sixth after the point are as good as chance.
+    # The digits after the sixth decimal act as random numbers.
     digits = ca.floor(1e6 * ca.fabs(x))
     stage_choice = digits - stages * ca.floor(digits / stages)
     after = ca.Function(
@@ -389,7 +389,7 @@ def staged_step(stages: int) -> StepGraph:
     return StepGraph(name, outer, layout, Layout((Field("p"),)), COUNT, stage="stage")
 
 
-# Eleven stages are more than the driver keeps apart.
+# Eleven stages are more than the driver has queues for.
 @pytest.mark.parametrize("stages", [2, 4, 11])
 @pytest.mark.parametrize("count", COUNTS)
 @LANES
@@ -404,7 +404,7 @@ def test_stages(stages, count):
 @pytest.mark.parametrize("count", COUNTS)
 @LANES
 def test_all_statuses_in_neighbouring_lanes(count):
-    """Done, repeated, not finite, out of iterations: side by side in one batch."""
+    """Done, repeated, non-finite and unfinished solves run side by side in one batch."""
     x, p = ca.SX.sym("x"), ca.SX.sym("p", 2)
     counting, exploding = x + 1, x * x * 1e30
     circling = ca.if_else(x >= 20, x - 3, x + 1)
@@ -432,7 +432,7 @@ def test_lanes_end_where_a_state_comes_back():
 
 @LANES
 def test_traces_longer_than_the_previous():
-    """Room is made for as much as the last one needed: too much, too little, none at all."""
+    """The reserved memory follows the previous trace: too large, too small, none."""
     kernel = LoopKernel(counting_step("lengths"))
     assert kernel.lanes > 1
     for count, ends in (
@@ -452,7 +452,7 @@ def test_traces_longer_than_the_previous():
 
 
 def test_small_batches_do_not_wait_for_a_compiler(monkeypatch, tmp_path, lanes):
-    """Until a library is at hand, whoever had it made."""
+    """Lanes are used once their library exists, whoever compiled it."""
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
     step = dataclasses.replace(counting_step(f"few_{lanes}"), recipe="counting")
 

@@ -1,4 +1,4 @@
-"""A machine whose only compiler is the Python package ziglang."""
+"""A machine whose only compiler is the Python package ziglang works."""
 
 from __future__ import annotations
 

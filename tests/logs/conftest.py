@@ -1,4 +1,4 @@
-"""Writing made-up solves to a log."""
+"""Fixture that writes made-up solves to a log."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from casadi_ik import logs
 
 @pytest.fixture
 def write(tmp_path: Path) -> Callable[..., Path]:
-    """Writes solves to a log and gives its path."""
+    """Function that writes solves to a log and returns its path."""
 
     def run(*blocks: SolveBlock, name: str = "cup.mcap", **options: Any) -> Path:
         path = tmp_path / name

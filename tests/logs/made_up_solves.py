@@ -1,4 +1,4 @@
-"""A made-up robot of 14 coordinates and 3 fingers, solves of it, and logs rewritten by others."""
+"""Made-up robot of 14 coordinates and 3 fingers, its solves, and rewritten logs."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ FORMAT = TraceFormat(LAYOUT, LABELS, {"closed_chain": RecordedJacobian(JOINTS[:3
 
 
 def make_rows(seed: int, count: int, layout: Layout = LAYOUT) -> np.ndarray:
-    """The trace of one solve: random bytes made valid, NaN, infinities and all."""
+    """Return a trace of one solve: random valid values, with NaN and infinities."""
     rng = np.random.default_rng(seed)
     rows = np.zeros(count, layout.dtype)
     for item in layout:
@@ -85,7 +85,7 @@ def make_rows(seed: int, count: int, layout: Layout = LAYOUT) -> np.ndarray:
 def make_block(
     *counts: int, first: int = 0, method: str = "enhanced-dls", form: TraceFormat = FORMAT
 ) -> SolveBlock:
-    """Solves with so many iterations each; those of odd numbers stalled."""
+    """Return solves with these numbers of iterations; those of odd numbers stalled."""
     numbers = first + np.arange(len(counts))
     rng, k = np.random.default_rng(first), len(counts)
     normals = rng.normal(size=(k, 3, 3))
@@ -135,7 +135,7 @@ def make_block(
 
 
 def changed(block: SolveBlock, **fields: object) -> SolveBlock:
-    """The block with other fields; those of its batch too."""
+    """Return the block with other fields, those of its batch included."""
     names = {item.name for item in dataclasses.fields(BatchSolution)}
     of_batch = {name: value for name, value in fields.items() if name in names}
     other_fields = {name: value for name, value in fields.items() if name not in names}
@@ -144,7 +144,7 @@ def changed(block: SolveBlock, **fields: object) -> SolveBlock:
 
 
 def chunks_of(path: Path) -> list[ChunkIndex]:
-    """The chunks of a complete file, as an independent reader finds them."""
+    """Return the chunks of a complete file, read by an independent reader."""
     with path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
@@ -158,9 +158,9 @@ def rewritten(
     schema: Callable[[str], str] = str,
     **options: object,
 ) -> Path:
-    """The same messages by mcap's own writer, by their times; perhaps other contents around them.
+    """Rewrite a log by mcap's own writer in the order of times, optionally with other contents.
 
-    Every checksum is right.
+    All checksums are right.
     """
     copy = path.with_name("copy.mcap")
     with path.open("rb") as source, copy.open("wb") as target:

@@ -1,4 +1,4 @@
-"""Solves whose story is known because it was made up."""
+"""Made-up solves with a known course."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LABELS = {
 
 
 def make_rows(count: int = 40) -> np.ndarray[Any, np.dtype[Any]]:
-    """20 iterations of thumb reaching, then hand alignment; far off, at no limit, regular."""
+    """Return 20 iterations of thumb reaching and of hand alignment, all out of tolerance."""
     rows = np.zeros(count, LAYOUT.dtype)
     rows["position_error"] = 0.1
     rows["angle_error"] = 0.2
@@ -44,7 +44,7 @@ def make_rows(count: int = 40) -> np.ndarray[Any, np.dtype[Any]]:
 
 
 def make_one(rows: np.ndarray[Any, np.dtype[Any]], **changes: Any) -> SolveRecord:
-    """A solve with a trace; how it ended follows from its last row."""
+    """Return a solve with a trace; its result follows from the last row."""
     position, angle = (
         rows["position_error"][-1].astype(float),
         rows["angle_error"][-1].astype(float),
@@ -77,6 +77,6 @@ def make_one(rows: np.ndarray[Any, np.dtype[Any]], **changes: Any) -> SolveRecor
 
 
 def event(iteration: int, kind: str, value: float = 0.0, **changes: Any) -> Event:
-    """An event with nothing in it but what is said."""
+    """Return an event with neutral values except for the given ones."""
     values: dict[str, Any] = {"jacobian": "", "joints": (), "phase": "", "threshold": 0.0}
     return Event(iteration, kind, value=value, **(values | changes))

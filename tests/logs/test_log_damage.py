@@ -1,4 +1,4 @@
-"""Damaged, cut and crafted files: the truth or one plain line, whoever reads them."""
+"""Damaged, truncated and crafted files give the truth or one error line, for all readers."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ with logs.McapRecorder(sys.argv[1], robot_name="made_up") as recorder:
 @POSIX
 @pytest.mark.parametrize("after", [0.0, 0.2])
 def test_a_killed_writer(tmp_path: Path, after: float) -> None:
-    """All but the chunk being filled and the one being written is there."""
+    """Only the chunk being filled and the one being written are lost."""
     path = tmp_path / "killed.mcap"
     command = [sys.executable, "-c", WRITER, str(path), str(Path(__file__).parent)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as writer:
@@ -72,7 +72,7 @@ def test_a_killed_writer(tmp_path: Path, after: float) -> None:
     assert len(solves) <= recorded + 20
     assert len(log.iterations()) == 400 * len(solves)
     assert log.iterations(solve=41).rows.tobytes() == make_block(400, first=41).rows.tobytes()
-    # The lock died with the writer.
+    # The lock ended with the writer.
     with logs.McapRecorder(path, robot_name="made_up"):
         pass
 
@@ -129,9 +129,9 @@ def test_cut_log_keeps_its_complete_records(
         assert rows == truth[: len(rows)]
         row_counts.append(len(rows))
         finished = logs.finish_log(path)
-        kept = read_messages(path)
-        assert kept == messages[: len(kept)]
-        assert (finished.changed, finished.messages) == (True, len(kept))
+        repaired = read_messages(path)
+        assert repaired == messages[: len(repaired)]
+        assert (finished.changed, finished.messages) == (True, len(repaired))
         assert finished.chunks == sum(end <= length for end in ends)
         assert iterations_of(path) == rows
         assert not logs.finish_log(path).changed
@@ -224,7 +224,7 @@ BOUNDED = settings(
 
 
 def said_by(path: Path) -> Any:
-    """All that a log says."""
+    """Return the complete contents of a log."""
     log = logs.open(path)
     tables = log.solves(), log.iterations(), log.events()
     return (
@@ -241,7 +241,7 @@ def said_by(path: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A log of two methods with an attachment."""
+    """Bytes of a log of two methods with an attachment."""
     path = tmp_path_factory.mktemp("small") / "small.mcap"
     with logs.McapRecorder(path, robot_name="made_up", urdf="<robot/>", seed=3) as recorder:
         recorder.record(make_block(30, 20))
@@ -250,7 +250,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def places(data: bytes, path: Path) -> list[int]:
-    """Bytes to flip: first and last of every kind of record, of its head, and some between."""
+    """Return the bytes to flip: ends of every kind of record and header, and some between."""
     path.write_bytes(data)
     rng, positions = np.random.default_rng(4), {0, len(data) - 1}
     kinds: dict[type, int] = {}
@@ -267,7 +267,7 @@ def places(data: bytes, path: Path) -> list[int]:
 
 
 def test_a_flipped_bit_anywhere(small: bytes, tmp_path: Path) -> None:
-    """Reading, merging, finishing and a table: refused by name, or the same content."""
+    """All operations refuse the file by name or give the same content."""
     path, merged, table = (tmp_path / name for name in ("log.mcap", "all.mcap", "all.parquet"))
     offsets = places(small, path)
     truth, rng, refused = said_by(path), np.random.default_rng(5), 0
@@ -301,13 +301,13 @@ def test_a_flipped_bit_anywhere(small: bytes, tmp_path: Path) -> None:
 
 
 def crafted(data: bytes, path: Path, *changes: Any) -> Path:
-    """The log with other metadata, labels or schemas, every checksum right; see `rewritten`."""
+    """Return the log with other contents and right checksums; see `rewritten`."""
     path.write_bytes(data)
     return rewritten(path, *changes).replace(path)
 
 
 def ask_everything(path: Path, capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """Every question of the command line; gives its refusals, each a plain line."""
+    """Run every command of `casadi-ik log`, and return the refusals, each of one line."""
     refusals = []
     for words in (
         ("info", path),
@@ -433,7 +433,7 @@ def test_any_metadata_and_labels(
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 @pytest.mark.parametrize("seed", range(12))
 def test_any_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str], seed: int) -> None:
-    """Any bytes in the rows of a kind of messages, behind their numbers and times."""
+    """Rows of one kind of messages may contain any bytes behind their numbers and times."""
     rng, path = np.random.default_rng(seed), tmp_path / "any.mcap"
     with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
         recorder.record(make_block(30, 20))
@@ -457,7 +457,7 @@ GIGABYTES = 3 * 10**9
 
 
 def with_chunk(folder: Path, chunk: Chunk) -> Path:
-    """A closed file that holds nothing but a chunk."""
+    """Write a closed file with a single chunk."""
     builder = RecordBuilder()
     builder.write(MCAP0_MAGIC)
     for record in (Header("ros2", "a test"), chunk, DataEnd(0), Footer(0, 0, 0)):
@@ -471,7 +471,7 @@ def with_chunk(folder: Path, chunk: Chunk) -> Path:
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 @pytest.mark.parametrize("expected_words", [GIGABYTES, 1000])
 def test_oversized_chunk_is_refused(tmp_path: Path, compression: str, expected_words: int) -> None:
-    """The size may be stated in the header, in the compressed data, or in neither."""
+    """The size may be stated in the header, in the compressed data, or nowhere."""
     zeros = bytes(2**24)
     packed = {
         "zstd": lambda: zstandard.ZstdCompressor(
@@ -501,7 +501,7 @@ def test_foreign_records_in_chunks_are_refused(tmp_path: Path) -> None:
 
 
 def huge(path: Path) -> Path:
-    """A log whose first chunk says that it unpacks to 3 GB, summary and all."""
+    """Return a log whose first chunk claims to unpack to 3 GB, with a matching summary."""
     size = chunks_of(path)[0].uncompressed_size
     data = path.read_bytes().replace(struct.pack("<Q", size), struct.pack("<Q", GIGABYTES))
     magic, start = len(b"\x89MCAP0\r\n"), data.rindex(struct.pack("<BQ", Opcode.FOOTER, 20))

@@ -1,4 +1,4 @@
-"""Every kind of event is found where it happens, and nowhere else."""
+"""Every kind of event is detected where it happens, and nowhere else."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Event:
 
 
 def trace_of(**columns: Any) -> tuple[Layout, np.ndarray]:
-    """A layout and trace with these columns, (k,) or (k, ...)."""
+    """Return a layout and a trace with these columns, (k,) or (k, ...)."""
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     layout = Layout.record(
         *(Field(name, a.shape[1:], STORAGE.get(name, "f8")) for name, a in arrays.items())
@@ -63,7 +63,7 @@ def found_in(
     rules: logs.EventRules | None = None,
     counts: Sequence[int] | None = None,
 ) -> tuple[Event, ...]:
-    """All events, as a person reads them."""
+    """Return all events with names instead of codes."""
     form = TraceFormat(layout, labels or {}, jacobians or {})
     count = np.array([len(trace)] if counts is None else counts)
     rows = logs.detect_events(form, trace, count, rules)
@@ -135,13 +135,13 @@ K = np.arange(40)
                 Event(2, KIND.RELEASED, "a", 2.0, 1.0, ("a",)),
             ],
         ),
-        # nothing happens while it converges, stands at zero or makes progress to and fro
+        # No events for convergence, a standstill at zero, or alternating progress.
         ({"q": np.stack([1 - 0.5**K, 0.5**K], axis=1), "cost": 0.5**K}, {}, []),
         ({"cost": np.zeros(40)}, {}, []),
         ({"q": 0.1 * (-0.8) ** K[:, None], "cost": 0.1 * 0.8**K}, {}, []),
         ({"q": 1e-6 * (-1.0) ** K[:, None]}, {}, []),
         ({"q": np.where(K < 5, 0.1 * (-1.0) ** K, 0.0)[:, None]}, {}, []),
-        # nor in what is no number, or in fields of others
+        # No events for non-finite numbers or unknown fields.
         ({"q": np.zeros((1, 2)), "cost": [1.0], "phase": [0]}, {}, []),
         ({"cost": np.full(40, np.inf), "q": np.full((40, 2), np.nan)}, {}, []),
         ({"sigma_arm": np.full(40, np.nan)}, {}, []),
@@ -174,7 +174,7 @@ def test_a_stall_ends_with_its_phase() -> None:
 
 
 def test_near_singular_on_entry_only() -> None:
-    """Below the threshold of the Jacobian's method, or the one given; with its joints."""
+    """The threshold is that of the Jacobian or of the rules; the event names its joints."""
     nan = np.nan
     sigma = [0.5, 0.05, 0.01, 0.12, 0.05, 0.2, 0.09, nan, 0.09, 0.5]
     layout, trace = trace_of(sigma_closed_chain=sigma)
@@ -197,7 +197,7 @@ def test_ill_conditioned_by_its_own_threshold() -> None:
     arm = {"arm": RecordedJacobian(("a",), singular=0.1, condition=200.0)}
     events = found_in(layout, trace, {"q": ("a",)}, arm)
     assert {e.kind for e in events} == {logs.EventKind.ILL_CONDITIONED}
-    # 150 is no release: it would have to fall below 200 / 1.5.
+    # 150 does not end the event: the value would have to fall below 200 / 1.5.
     assert [(e.iteration, e.value) for e in events] == [(1, 400.0), (6, 201.0)]
     assert {(e.jacobian, e.joints, e.threshold) for e in events} == {("arm", ("a",), 200.0)}
 
@@ -222,7 +222,7 @@ def test_stall_once_per_standstill() -> None:
 
 
 def test_stall_by_errors_when_one_finger_is_stuck() -> None:
-    """A finger that sits still in place is no stall while another one moves; then it is."""
+    """A resting finger is a stall only once the other fingers rest, too."""
     errors = np.full((40, 2), np.nan)
     errors[:, 0] = 1e-9 * (1 + np.arange(40) % 2)
     moving = errors.copy()
@@ -274,7 +274,7 @@ def test_windows_are_checked() -> None:
 @settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), counts=st.lists(st.integers(0, 40), min_size=1, max_size=5))
 def test_solves_have_independent_events(seed: int, counts: list[int]) -> None:
-    """A block of solves has the events of its solves, whatever stands before and after them."""
+    """The events of a solve do not depend on the solves before and after it in a block."""
     rng = np.random.default_rng(seed)
     m = sum(counts)
     k = np.arange(m)
@@ -300,7 +300,7 @@ def test_solves_have_independent_events(seed: int, counts: list[int]) -> None:
 
 
 def test_collision_entries_and_exits() -> None:
-    """Two solves: one begins touching and is free twice, the other is always free."""
+    """One solve starts in collision and is free twice; another is always free."""
     form = TraceFormat(Layout.record(Field("clearance", (), "f4", "m")))
     rows = np.zeros(9, form.layout.dtype)
     rows["clearance"] = [-0.01, 0.001, 0.003, 0.001, 0.004, 0.002, 0.005, np.nan, 0.002]
@@ -337,7 +337,7 @@ def test_a_log_with_a_scene(robot, tmp_path: Path) -> None:
     np.testing.assert_allclose(solves.rows["clearance"], batch.clearance)
     named = [(record["closest_first"], record["closest_second"]) for record in solves.records()]
     assert named == list(batch.closest)
-    # Every iteration's is that of its q with its own object's pose.
+    # The clearance of every iteration is that of its q with the object's pose of its solve.
     around = query_of_contacts(solver, points, normals, ("cup", poses))
     expected = around.rows(rows.solve_id).check(np.ascontiguousarray(rows.rows["q"]))
     np.testing.assert_allclose(
@@ -375,7 +375,7 @@ def margins(robot, q):
 
 
 def logged(robot, path, q, rules=None):
-    """A log of a solve that ends at q, and its rows and events."""
+    """Return the rows and events of a log of a solve that ends at q."""
     points, normals = robot.contacts(q)
     solver = ik.Solver(robot)
     with logs.McapRecorder(path, robot_name=robot.name, rules=rules) as recorder:
@@ -393,7 +393,7 @@ def test_lowest_clearance_is_recorded(ar10, tmp_path):
 
 
 def test_near_a_toggle_is_an_event_that_names_the_motors(ar10, tmp_path):
-    """The shipped strokes keep clear of it, so the threshold is raised to where they go."""
+    """The shipped strokes avoid toggles, so that the threshold is raised."""
     q = ar10.random(np.random.default_rng(1), 1)[0]
     _, events = logged(ar10, tmp_path / "clear.mcap", q)
     assert events == []
@@ -413,7 +413,7 @@ STEP = 1e-6
 
 
 def spread(robot: ik.ArmHand, q: np.ndarray, of: str, columns: tuple[int, ...]) -> np.ndarray:
-    """Singular values of a Jacobian by central differences, descending."""
+    """Return the singular values of a Jacobian by central differences, in descending order."""
     jacobian_columns = []
     for column in columns:
         ahead, behind = q.copy(), q.copy()
@@ -434,7 +434,7 @@ def spread(robot: ik.ArmHand, q: np.ndarray, of: str, columns: tuple[int, ...]) 
 
 @pytest.fixture(scope="module")
 def arms(robot: ik.ArmHand) -> np.ndarray:
-    """Configurations whose elbow is straight to 1e-3 rad, within limits: the arm is singular."""
+    """Configurations with an elbow straight to 1e-3 rad, so that the arm is singular."""
     rng = np.random.default_rng(40)
     q = robot.random(rng, 6)
     q[:, robot.actuators.index("lwr_joint_4")] = rng.normal(0, 1e-3, 6)
@@ -443,7 +443,7 @@ def arms(robot: ik.ArmHand) -> np.ndarray:
 
 @pytest.fixture(scope="module", params=ik.METHODS)
 def log(request, robot, arms, tmp_path_factory) -> logs.Log:
-    """A log of solves that begin at the answer, next to the singularity."""
+    """Log of solves that start at the answer, close to the singularity."""
     path = tmp_path_factory.mktemp("singular") / f"{request.param}.mcap"
     solver = ik.Solver(
         robot, request.param, options=OPTIONS.get(request.param, {}), finger_step="closed-form"
@@ -453,7 +453,7 @@ def log(request, robot, arms, tmp_path_factory) -> logs.Log:
 
 
 def test_recorded_values_match_recomputation(robot, log):
-    """Against singular values of central differences, which know nothing of the measure."""
+    """Recorded values equal singular values of central differences."""
     rows = log.iterations().rows
     row_sample = rows[:: max(len(rows) // 12, 1)]
     arm = robot.description.arm_actuators
@@ -476,7 +476,7 @@ def test_recorded_values_match_recomputation(robot, log):
 
 
 def test_singular_arms_are_events_in_every_method(robot, log):
-    """Every solve that comes to a singular arm has the event, its joints and its threshold."""
+    """Every solve that meets a singular arm has the event with its joints and its threshold."""
     solves = log.solves()
     lowest = solves.rows["lowest_sigma"][:, solves.labels["lowest_sigma"].index("arm")]
     events = [r for r in log.events(event="NEAR_SINGULAR").records() if r["jacobian"] == "arm"]
@@ -489,7 +489,7 @@ def test_singular_arms_are_events_in_every_method(robot, log):
 
 
 def test_thumb_first_measures_its_closed_chain(robot):
-    """Five rows of the thumb's contact over arm and thumb; by central differences again."""
+    """The closed chain is five rows of the thumb's contact, by central differences."""
     measures = JacobianMeasures(robot.description, closed_chain=True)
     q = robot.random(np.random.default_rng(3), 5)
     rows = np.zeros(5, [("q", "f8", q.shape[1]), ("phase", "u1")])

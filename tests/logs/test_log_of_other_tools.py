@@ -1,4 +1,4 @@
-"""Logs that other tools for MCAP files have rewritten, and files of theirs that are not logs."""
+"""Logs that other MCAP tools have rewritten, and other MCAP files."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def rows_of(path: Path) -> list[bytes]:
     ],
 )
 def test_the_summary_and_its_parts_are_optional(log: Path, options: dict[str, Any]) -> None:
-    """A rewritten log holds the same rows, whatever the tool's writer leaves out."""
+    """A rewritten log has the same rows, whichever parts the writer leaves out."""
     copy = rewritten(log, **options)
     assert rows_of(copy) == rows_of(log)
     assert logs.open(copy).metadata["robot"] == "made_up"
@@ -91,7 +91,7 @@ def test_a_log_without_summary_is_complete(log: Path) -> None:
 
 
 def test_message_indexes_in_any_order_are_kept(log: Path) -> None:
-    """A torn log whose chunks are followed by indexes of another order loses none of them."""
+    """An incomplete log with message indexes in another order loses none of them."""
     builder, indexes = RecordBuilder(), list[MessageIndex]()
     builder.write(MCAP0_MAGIC)
     with log.open("rb") as stream:
@@ -171,7 +171,7 @@ def test_a_bag_without_chunks_is_not_a_log(
 def test_a_folder_with_logs_of_other_objects_and_a_bag(
     tmp_path: Path, write: Write, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Logs differ in fields (other fingers' names, no Jacobian) and are still read together."""
+    """Logs with other fields (names of fingers, no Jacobian) are read together."""
     folder = tmp_path / "study"
     (folder / "bags").mkdir(parents=True)
     names = {**LABELS, "position_error": ("thumb", "index", "middle")}
@@ -193,7 +193,7 @@ def test_a_folder_with_logs_of_other_objects_and_a_bag(
         code = main(["log", words[0], str(folder), *words[1:]])
         assert code == (2 if words == ["compare"] else 0), words  # which has one method only
         capsys.readouterr()
-    # A bag that is named, or alone in a folder, is refused.
+    # A bag is refused when it is named or alone in a folder.
     for path in (
         folder / "bags",
         folder / "bags" / "ride.mcap",

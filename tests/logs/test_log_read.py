@@ -1,4 +1,4 @@
-"""Questions to a log: filters, several files as one, dataframes, origins; logs merged."""
+"""Queries of logs: filters, several files, data frames, origins, merged logs."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_only_requested_chunks_are_read(write: Write) -> None:
     ],
 )
 def test_unknown_names(write: Write, filters: dict[str, Any], known_names: str) -> None:
-    """A filter, its value or a field that the log does not have is named beside the known ones."""
+    """The error names the unknown filter, value or field, and the known ones."""
     log = logs.open(write(make_block(30)))
     ((name, value),) = filters.items()
     unknown = name if name == "stauts" else value if isinstance(value, str) else value[-1]
@@ -163,7 +163,7 @@ def test_files_that_do_not_belong_together(write: Write, tmp_path: Path) -> None
 
 
 def test_policy_keeps_the_selected_solves(write: Write) -> None:
-    """Totals of all; iterations and events of failed, of singular ones and of a seeded sample."""
+    """All solves keep totals; failed, singular and sampled ones keep iterations and events."""
     block = make_block(*[20] * 400)
     rows = block.rows.copy()
     rows["sigma_closed_chain"] = 1.0
@@ -246,7 +246,7 @@ NAMES = ("loose/cup/00000.mcap", "loose/cup/00001.mcap", "tight/cup/00000.mcap")
 
 @pytest.fixture
 def study(write: Write, tmp_path: Path) -> Path:
-    """Three shards in two settings, each counting from 0, with a sample of its own."""
+    """Three shards of two settings, each numbered from 0 and with a sample of its own."""
     folder = tmp_path / "study"
     for i, (name, counts) in enumerate(zip(NAMES, COUNTS, strict=True)):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -289,7 +289,7 @@ def test_solve_numbers_continue_across_shards(study: Path) -> None:
 
 
 def test_origin_of_a_solve(study: Path, tmp_path: Path) -> None:
-    """In the folder as in what was merged from it, and in what was merged from that."""
+    """The origin is the same in the folder, in a merged log, and in a log merged from that."""
     merged = logs.merge_logs([study], tmp_path / "all.mcap").path
     other_block = make_block(7, method="hand-first")
     with logs.McapRecorder(tmp_path / "b.mcap", robot_name="made_up", urdf="<robot/>") as recorder:
@@ -346,7 +346,7 @@ def test_unique_numbers_are_kept(write: Write, tmp_path: Path) -> None:
 
 
 def test_duplicate_solve_is_counted_once(study: Path) -> None:
-    """A merged log beside its shards, whatever numbers it has."""
+    """A merged log beside its shards is detected, whatever its numbers are."""
     logs.merge_logs(study, study / "all.mcap")
     with pytest.raises(errors.LogError, match=r"00000\.mcap:.*1.*enhanced-dls.*all\.mcap"):
         logs.open(study).solves()
@@ -442,7 +442,7 @@ def test_motion_round_trips_or_is_refused(tmp_path: Path) -> None:
 
 
 def block_of(number: int) -> SolveBlock:
-    """A block of one solve of 50 iterations."""
+    """Return a block of one solve of 50 iterations."""
     return make_block(50, first=number)
 
 

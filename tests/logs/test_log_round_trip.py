@@ -1,4 +1,4 @@
-"""What was written is what is read, by us and by three others; a solve is repeated from it."""
+"""Logs are read as they were written, by four readers; a solve is repeated from its log."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CDR_HEADER = b"\0\1\0\0"
 
 
 def assert_row(message: object, row: np.void) -> None:
-    """Every number of a decoded ROS message is that of the row, NaN included."""
+    """Assert that every number of a decoded ROS message is that of the row, including NaN."""
     for name in row.dtype.names or ():
         logged = getattr(message, name)
         if isinstance(logged, bytes):
@@ -50,7 +50,7 @@ def assert_row(message: object, row: np.void) -> None:
 
 
 def assert_solves(table: logs.Table, block: SolveBlock) -> None:
-    """The solves of a block, and nothing else."""
+    """Assert that a table has exactly the solves of a block."""
     rows, batch = table.rows, block.batch
     np.testing.assert_array_equal(rows["solve_id"], block.first + np.arange(len(block)))
     np.testing.assert_array_equal(rows["solve_id"], table.solve_id)
@@ -150,7 +150,7 @@ def test_the_lowest_singular_values_are_kept(write: Write) -> None:
 
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
 def test_mcap_and_mcap_ros2_and_rosbags(write: Write, compression: str) -> None:
-    """Two readers that share nothing find every row; heads and constants are as viewers want."""
+    """Two independent readers give every row, and schemas and constants are as viewers expect."""
     block = make_block(50, 20, first=2)
     path = write(block, make_block(3, method="hand-first"), compression=compression)
     log = logs.open(path)
@@ -283,7 +283,7 @@ GRASP = ik.load_grasp("cup")
 
 
 def repeated(solve: logs.SolveRecord) -> ik.Solution:
-    """The same asked again, of a solver built from the log."""
+    """Return the solution of the same target by a solver that is built from the log."""
     contacts = {
         finger: ik.Contact(point, None if np.isnan(normal).any() else normal, tolerance)
         for finger, point, normal, tolerance in zip(
@@ -304,7 +304,7 @@ def repeated(solve: logs.SolveRecord) -> ik.Solution:
 
 @pytest.mark.parametrize("limits", ["enforce", "ignore"])
 def test_a_solve_is_repeated_from_its_log(tmp_path: Path, limits: str) -> None:
-    """Own tolerances, a free normal, a start, a seed and a held actuator included."""
+    """The log keeps tolerances, a free normal, a start, a seed and a fixed actuator."""
     robot = ik.load_robot("kuka_lwr_barrett")
     contacts = dict(GRASP.contacts)
     contacts["thumb"] = ik.Contact(contacts["thumb"].point, None, ik.Tolerance(1e-5, 0.2))
@@ -324,7 +324,7 @@ def test_a_solve_is_repeated_from_its_log(tmp_path: Path, limits: str) -> None:
     assert (repeated_solution.status, repeated_solution.iterations, repeated_solution.restarts) == (
         *(first.status, first.iterations, first.restarts),
     )
-    # A unit normal that is normalised again may change in its last bit.
+    # Normalising a unit normal again may change its last bit.
     np.testing.assert_allclose(repeated_solution.q, first.q, rtol=0, atol=1e-9)
     limited_solution = ik.Solver(robot, limits=limits).solve(GRASP)
     assert not np.allclose(limited_solution.q, first.q, atol=1e-3)

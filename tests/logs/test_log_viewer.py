@@ -1,4 +1,4 @@
-"""Viewer files and logs, read by what Foxglove and Lichtblick are made of."""
+"""Viewer files and logs, read by the libraries of Foxglove and Lichtblick."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_frames_are_where_the_robot_was(
 
 
 def test_urdf_and_joint_states_give_the_same_frames(decoded: Decoded) -> None:
-    """The URDF as pinocchio reads it, set to the joint states, agrees with the transforms."""
+    """The URDF in pinocchio at the joint states gives the frames of the transforms."""
     model = pinocchio.buildModelFromXML(decoded.last("/robot_description").data)
     data = model.createData()
     state = decoded.last("/joint_states")

@@ -1,4 +1,4 @@
-"""Solves in words, made-up and real ones."""
+"""Explanations of made-up and real solves."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEGREE = float(np.deg2rad(1.0))
 
 
 def values(text: str) -> list[float]:
-    """Return the numbers of a sentence that are not part of a name."""
+    """Return the numbers in a sentence that are not parts of names."""
     return [
         float(word)
         for word in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*\w)", text)
@@ -153,7 +153,7 @@ def test_without_a_trace_only_the_result_is_described() -> None:
 
 
 def test_without_limits_phases_or_singular_values() -> None:
-    """A method that records less is explained with less."""
+    """A method that records less has a shorter explanation."""
     lean = Layout.record(*(f for f in LAYOUT if f.name in ("q", "position_error", "angle_error")))
     rows = np.zeros(3, lean.dtype)
     rows["position_error"] = 0.1
@@ -229,7 +229,7 @@ def test_targets_are_compared_up_to_rounding() -> None:
 
 
 COUNT = 5
-"""Arms per grasp."""
+"""Number of arms per grasp."""
 
 
 @pytest.fixture(scope="module")
@@ -263,7 +263,7 @@ def test_named_fingers_are_out_of_tolerance(
 
 
 def test_phase_errors_match_the_robot(failed: list[logs.SolveRecord], robot: ik.ArmHand) -> None:
-    """First and last distance of the thumb in a phase, recomputed from q."""
+    """The stated distances of the thumb at the start and end of a phase are recomputed from q."""
     thumb = robot.fingers.index(robot.thumb)
     for solve in failed:
         points, _ = robot.contacts(solve.rows["q"])

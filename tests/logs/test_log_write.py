@@ -1,4 +1,4 @@
-"""What a recorder refuses and what becomes of a log when writing fails."""
+"""Refusals of a recorder, and logs after failed writes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Write = Callable[..., Path]
 
 
 def record_many(path: Path, blocks: int) -> None:
-    """Six solves of 1000 iterations each make a chunk and a bit."""
+    """Record blocks of six solves with 1000 iterations each, which is more than a chunk."""
     with logs.McapRecorder(path, robot_name="made_up", compression="none") as recorder:
         for i in range(blocks):
             recorder.record(make_block(*[1000] * 6, first=6 * i))
@@ -83,7 +83,7 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
 
 
 def test_two_writers_on_one_path(tmp_path: Path) -> None:
-    """Refused in the same process and in another; the log of the first is not touched."""
+    """A second writer is refused in the same process and in another; the first log is unchanged."""
     path = tmp_path / "cup.mcap"
     program = (
         "import sys\nfrom casadi_ik import errors, logs\n"
@@ -126,7 +126,7 @@ def test_existing_log_is_kept_until_the_first_chunk(tmp_path: Path) -> None:
 def test_an_interrupt_while_a_chunk_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
 ) -> None:
-    """The bytes of the interrupted chunk are overwritten: the log continues before it."""
+    """The log continues before the interrupted chunk, whose bytes are overwritten."""
     write, calls = os.write, []
 
     def interrupted(descriptor: int, data: Any) -> int:
@@ -266,13 +266,13 @@ LIMIT = 3 * 2**21
 
 @pytest.fixture
 def small_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Readers and writers that take little."""
+    """Set a small size limit of records."""
     monkeypatch.setattr("casadi_ik.logs.chunks.RECORD_LIMIT", LIMIT)
 
 
 @pytest.mark.usefixtures("small_limit")
 def test_every_written_solve_is_readable(tmp_path: Path) -> None:
-    """Solves that do not fit a record are refused; all others are read, and no others."""
+    """Solves that do not fit a record are refused, and all others are read."""
     path = tmp_path / "x.mcap"
     lengths, refused = range(1000, 9001, 500), []
     with logs.McapRecorder(path, robot_name="made_up", compression="lz4") as recorder:

@@ -1,4 +1,4 @@
-"""A viewer file as libraries other than ours read it, and drawn from nothing but that."""
+"""Viewer files as decoded by other libraries."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Decoded", "decode", "layout_of", "shipped_layout", "write_view"]
 
 @dataclass(frozen=True)
 class Decoded:
-    """Messages by topic, each with its log time [ns]."""
+    """Decoded messages by topic, each with its log time [ns]."""
 
     topics: dict[str, list[tuple[int, Any]]]
     schemas: dict[str, str]
@@ -28,7 +28,7 @@ class Decoded:
         return self.topics[topic][-1][1]
 
     def frames(self, row: int) -> dict[str, np.ndarray]:
-        """Pose of every frame in the root's, from the transforms of one message."""
+        """Return the pose of every frame in the root frame, from the transforms of one message."""
         message = self.topics["/tf"][row][1]
         parents = {t.child_frame_id: t for t in message.transforms}
         root = next(
@@ -46,7 +46,7 @@ class Decoded:
 
 
 def matrix(position: Any, q: Any) -> np.ndarray:
-    """(4, 4) pose of a message's position and orientation."""
+    """Return the pose (4, 4) of the position and orientation of a message."""
     pose = np.eye(4)
     pose[:3, :3] = pinocchio.Quaternion(q.w, q.x, q.y, q.z).matrix()
     pose[:3, 3] = position.x, position.y, position.z

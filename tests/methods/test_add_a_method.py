@@ -1,4 +1,4 @@
-"""The method of docs/add_a_method.md: its very lines solve, step, batch and log."""
+"""The method of docs/add_a_method.md solves, steps, runs in batches and logs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from casadi_ik import errors
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """The page's lines as a module; the method is known as long as these tests run."""
+    """Module with the lines of the page; the method is registered during these tests."""
     path = tmp_path_factory.mktemp("page") / "example_method.py"
     path.write_text("\n".join(blocks("add_a_method.md")), encoding="utf-8")
     spec = importlib.util.spec_from_file_location("example_method", path)
@@ -31,7 +31,7 @@ def page(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def targets(page):
-    """(8, f, 3) points and normals."""
+    """Points and normals (8, f, 3)."""
     return page.robot.contacts(near_home(page.robot, np.random.default_rng(7), 8))
 
 

@@ -1,4 +1,4 @@
-"""What is special about the sliders of the AR10: free fingers stay, and triangles close."""
+"""Sliders of the AR10: unconstrained fingers stay, and triangles stay closed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import casadi_ik as ik
 
 
 def contacts(robot, q, fingers):
-    """Targets (k, f, 3): contacts of some fingers [m], NaN for the others."""
+    """Return targets (k, f, 3): contacts of some fingers [m], NaN for the others."""
     points, normals = robot.contacts(q)
     free = [finger not in fingers for finger in robot.fingers]
     points[:, free], normals[:, free] = np.nan, np.nan
@@ -33,7 +33,7 @@ def test_free_fingers_stay(robot, rng):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["hand-first", "ipopt"])
 def test_without_limits_a_slider_keeps_to_its_triangle(robot, method, rng):
-    """Beyond it there is no such mechanism, limits or not."""
+    """Beyond that stroke the mechanism does not exist, even without limits."""
     points, normals = robot.contacts(robot.random(rng, 2))
     points[:, 1:] += rng.uniform(-0.03, 0.03, (2, 4, 3))
     batch = ik.Solver(robot, method, limits="ignore").solve_batch(points, normals)

@@ -1,4 +1,4 @@
-"""Arms beyond S-R-S: every target solved, by the arm in closed form where there is one."""
+"""Arms that are not S-R-S: every target is solved, by a closed form where one exists."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def solver(panda) -> ik.Solver:
 )
 def test_an_arm_without_a_closed_form(tmp_path_factory, method, tolerance, min_solved):
     robot = derived_robot(tmp_path_factory.mktemp("offset"), wrist_offset=0.045)
-    # Few enough that no second kernel is compiled for many side by side.
+    # Few enough targets that no kernel in lanes is compiled.
     q = robot.random(np.random.default_rng(5), 60)
     batch = ik.Solver(robot, method, tolerance).solve_batch(*robot.contacts(q))
     assert batch.success.mean() >= min_solved
@@ -50,11 +50,11 @@ def test_an_arm_without_a_closed_form(tmp_path_factory, method, tolerance, min_s
 @pytest.mark.slow
 @pytest.mark.parametrize("arm", [*SINGLE, "kinova_gen3", "xarm6", "sawyer"])
 def test_arm_follows_the_hand_immediately(arm):
-    """Six joints in one evaluation; an arm that is only nearly of its form is refined."""
+    """A six-joint arm needs one evaluation; an arm that is only nearly of a family is refined."""
     robot = robot_of(arm)
     q = robot.random(np.random.default_rng(7), 12)
     batch = ik.Solver(robot, tolerance=EXACT, compiled=False).solve_batch(*robot.contacts(q))
-    # In the virtual machine a solve does not begin anew.
+    # The virtual machine has no restarts.
     assert batch.success.sum() >= 11
     assert batch.phases["arm-placement"].all()
     if arm in SINGLE:
@@ -69,12 +69,12 @@ def test_every_target_of_a_panda_is_solved(panda, solver):
     assert np.flatnonzero(~batch.success).tolist() == []
     assert (batch.q >= panda.lower).all()
     assert (batch.q <= panda.upper).all()
-    # Nearly all by the arm in closed form.
+    # The closed form solves nearly all.
     assert (batch.phases["refinement"][:1000] == 0).mean() > 0.97
 
 
 def test_targets_of_a_panda_with_a_joint_next_to_its_limit(panda, solver):
-    """Stretches of the swept joint of a few thousandths of a degree, for one joint or another."""
+    """Intervals of the swept joint of a few thousandths of a degree are found."""
     rng = np.random.default_rng(3)
     q = panda.random(rng, 400)
     joint, side = rng.integers(0, 7, len(q)), rng.integers(0, 2, len(q)).astype(bool)
@@ -84,7 +84,7 @@ def test_targets_of_a_panda_with_a_joint_next_to_its_limit(panda, solver):
 
 
 def held_hand(robot):
-    """A hand that cannot move: where the palm has to be is known, and the arm has to follow."""
+    """For a hand without motors, the arm must reach the one palm pose of the contacts."""
     description = robot.description
     hand = list(description.hand_actuators)
     middle = (robot.lower + robot.upper)[hand] / 2
@@ -96,7 +96,7 @@ def with_hand(robot, arms, hand):
 
 
 def test_short_intervals_of_the_swept_joint_are_found(panda, solver):
-    """With six of seven joints next to their limits some are a few ten-thousandths long."""
+    """With six of seven joints near their limits, some intervals are tiny."""
     hand = held_hand(panda)
     q_missed = [
         0.12332358,
@@ -111,14 +111,14 @@ def test_short_intervals_of_the_swept_joint_are_found(panda, solver):
     q = with_hand(panda, np.concatenate([[q_missed], targets]), hand)
     batch = solver.solve_batch(*panda.contacts(q), fixed=hand)
     assert np.flatnonzero(~batch.success).tolist() == []
-    # What the first round misses, most of the second's first trials find.
+    # Targets that the first restart misses are mostly solved by the first trials of the second.
     used_restarts = batch.restarts[batch.restarts > 0]
     assert len(used_restarts) > 3
     assert np.median(used_restarts) == solver.parameters["options"]["candidates"]
 
 
 def test_nearly_closed_form_straight_arm():
-    """There Newton's steps lead nowhere from the nominal arm: it is searched for."""
+    """From the nominal arm, Newton's method fails there, and the search succeeds."""
     robot = robot_of("kinova_gen3")
     hand = held_hand(robot)
     arms = [
@@ -147,7 +147,7 @@ def test_nearby_solutions_of_a_panda_are_found(panda, solver):
 
 @pytest.mark.parametrize("name", ["xarm6+barrett_bh8_280", "xarm6+shadow"])
 def test_nearby_solutions_of_a_searched_last_joint_are_found(name):
-    """A search on the branches would pass it by: it begins where the robot is."""
+    """A search of the branches would miss the arm; it starts where the robot is."""
     robot = ik.load_robot(name)
     rng = np.random.default_rng(4)
     q = robot.random(rng, 40)

@@ -1,4 +1,4 @@
-"""The balance of contacts that contradict each other."""
+"""Least-squares balance of contradictory contacts."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import casadi_ik as ik
 TOLERANCE = ik.Tolerance()
 THREE = ("index", "thumb", "middle")
 ALL = "kuka_lwr_barrett"
-"""All of its fingers are asked."""
+"""Robots of which all fingers have contacts."""
 
 
 def displaced(robot, rng, count, part, fingers=None):
-    """Contacts of configurations, moved and turned by a part of the tolerance: still met by q."""
+    """Return contacts of configurations, displaced by a part of the tolerance."""
     contacts = robot.contacts(robot.random(rng, count))
     points, normals = moved_targets(
         contacts, rng, part * TOLERANCE.position, part * TOLERANCE.angle
@@ -26,7 +26,7 @@ def displaced(robot, rng, count, part, fingers=None):
 
 
 def noisy(robot, rng, count):
-    """Contacts as a camera sees them; about one in fifty cannot be met."""
+    """Return noisy contacts as of a camera; about one in fifty cannot be met."""
     points, normals = robot.contacts(robot.random(rng, count))
     normals = normals + rng.normal(0, np.radians(2.0), normals.shape)
     return points + rng.normal(0, 4e-3, points.shape), normals
@@ -75,19 +75,19 @@ def test_results_are_independent_of_batch_and_blocks(robot):
     assert len(rows)
     for row in rows:
         solution = solver.solve(grasp_of(robot, points[row], normals[row]), diagnose=False)
-        # A grasp normalises its normals itself, so the last digit may differ.
+        # A grasp normalises its normals, so that the last digit may differ.
         np.testing.assert_allclose(solution.q, batch.q[row], atol=1e-6)
         assert solution.success == batch.success[row]
 
 
 def test_repeated_infeasible_minima_end_table_restarts(robot):
-    """Such targets used all restarts and up to 60 steps of a balance before they were given up."""
+    """Unreachable targets once used all restarts and up to 60 steps of a balance."""
     points, normals = noisy(robot, np.random.default_rng(11), 1000)
     solver = ik.Solver(robot)
     batch = solver.solve_batch(points, normals)
     missed = ~batch.success
     assert missed.sum() >= 10
-    # Two or three rounds of tables instead of six.
+    # Two or three restarts from tables suffice instead of six.
     given_up = 8 * (2 + 3 + 2) - 1
     assert given_up <= np.median(batch.restarts[missed]) <= given_up + 8
     assert np.median(batch.phases["balance"][missed]) < 15

@@ -1,4 +1,4 @@
-"""Targets and regions that hand-first missed once: it misses none of them again."""
+"""Targets and regions that hand-first once missed are solved."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ HANDS = [
     [0, 90, 48, 78, 46, 60, 31],
     [4, 94, 48, 78, 48, 47, 48],
 ]
-"""Spread, thumb, finger 2, finger 3 (proximal, distal) [deg]: every candidate lay on the other side
-of the spread."""
+"""Spread, then proximal and distal joints of thumb, finger 2 and finger 3 [deg]: all candidates of
+these postures had the other spread."""
 
 MISSED_ROWS = (87_229, 638_806)
-"""Rows of a million random configurations that were not solved."""
+"""Rows of a million random configurations that were once not solved."""
 
-# By what was in the way: robot, tolerance, motors that are held, configurations.
+# Cases by obstacle: robot, tolerance, fixed motors, configurations.
 ONCE_MISSED = {
     # Three fingers side by side: hands of quite another bend come within 2e-6 m of the contacts.
     "a fit rests in a valley": (
@@ -134,7 +134,7 @@ def test_formerly_lost_rows_are_solved(robot, solver):
 
 
 def test_arms_at_both_ends_of_nearly_a_full_turn():
-    """Nearly all of those missed among corners had joints there: 17 of 10,000."""
+    """Nearly all missed targets among corners had joints at limits there: 17 of 10,000."""
     robot, rng = ik.load_robot("baxter_ar10"), np.random.default_rng(4)
     q, fixed_index = robot.random(rng, 500), rng.integers(0, 3, (500, len(robot.lower)))
     q = np.where(fixed_index == 0, robot.lower, np.where(fixed_index == 1, robot.upper, q))
@@ -144,7 +144,7 @@ def test_arms_at_both_ends_of_nearly_a_full_turn():
 
 
 def test_hands_beyond_ignored_limits_are_found(robot, rng):
-    """Tables of postures within limits miss a hundredth of them."""
+    """Posture tables within limits missed 1 % of them."""
     q = robot.random(rng, 2000)
     q[:, 7:] += rng.uniform(-1, 1, (2000, 7))
     batch = ik.Solver(robot, limits="ignore").solve_batch(*robot.contacts(q))

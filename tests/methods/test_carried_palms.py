@@ -1,4 +1,4 @@
-"""Solves of hand-first that only carry the palms of a multi-arm robot to given poses."""
+"""Solves of hand-first that only move the palms of a multi-arm robot to given poses."""
 
 from typing import Any
 
@@ -53,7 +53,7 @@ def test_arms_are_placed_for_the_current_trunk(setup) -> None:
 
 
 def test_arms_that_cannot_follow_stay(setup) -> None:
-    """Arms that cannot follow moved to zero, as if the palms had been reached."""
+    """Arms that could not follow moved to zero, as if the palms had been reached."""
     robot, trials, targets, q = setup
     palms = side_palms(robot, q)
     palms[..., 2, 3] += 3.0

@@ -1,4 +1,4 @@
-"""What every method promises on arms and hands of the catalogue, without a compiler's time."""
+"""Contract of all methods on arms and hands of the catalogue, in the virtual machine."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ PAIRS = (
 )
 
 PLANAR = ("irb140+barrett_bh8_280", "xarm7+trifinger")
-"""Those with the planar fingers that the paper's subproblem is made for."""
+"""Hands with planar fingers, which the paper's subproblem requires."""
 
 FINDING = ("hand-first", "thumb-first", "ipopt")
-"""The paper's methods start once, and not every start ends within tolerance."""
+"""Minimal share of solved targets: the paper's methods have no restarts."""
 
 
 @pytest.fixture(scope="module", params=PAIRS)

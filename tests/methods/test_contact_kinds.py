@@ -1,4 +1,4 @@
-"""Contacts of every kind, asked of every method: solved, judged by others, kept, asked again."""
+"""Contacts of every kind with every method: solved, verified, logged, repeated."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from casadi_ik import logs
 METHODS = ("hand-first", "thumb-first", "ipopt")
 SIDE, UP = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.0, 1.0])
 RADIUS = 9.5e-3
-"""Of Barrett's pads [m]."""
+"""Radius of the pads of the Barrett hand [m]."""
 TIGHT = ik.Tolerance(1e-4, 1e-3)
 
 
 def frames(robot, seed=3):
-    """Contact frames (f, 4, 4) of a configuration near home."""
+    """Return contact frames (f, 4, 4) of a configuration near home."""
     return robot.contact_frames(near_home(robot, np.random.default_rng(seed), 1)[0])
 
 
 def contact(kind: str, frame: np.ndarray) -> ik.Contact:
-    """A contact of a kind that a fingertip at this frame meets, its point elsewhere if allowed."""
+    """Return a contact that a fingertip at this frame meets, displaced where allowed."""
     point, normal, tangent = frame[:3, 3], frame[:3, 0], frame[:3, 1]
     across = np.cross(UP, SIDE)
     leaning = np.cos(0.6) * normal + np.sin(0.6) * tangent
@@ -54,7 +54,7 @@ KINDS = (
 
 
 def off(frame: np.ndarray, requested: ik.Contact) -> tuple[float, float]:
-    """Distance [m] and angle [rad] of a fingertip from a contact, NaN where free."""
+    """Return distance [m] and angle [rad] of a fingertip from a contact, NaN where free."""
     beside, angle = frame[:3, 3] - requested.point, np.nan
     distance = float(np.linalg.norm(beside))
     if requested.line is not None:
@@ -76,7 +76,7 @@ def off(frame: np.ndarray, requested: ik.Contact) -> tuple[float, float]:
 
 
 def pinocchio_frames(oracle, q):
-    """Contact frames (f, 4, 4) from the written URDF by pinocchio."""
+    """Return contact frames (f, 4, 4) by pinocchio from the written URDF."""
     poses, contact_frames = oracle.frames(q), []
     for finger in oracle.robot.description.fingers:
         pose = poses[f"{finger.name}_contact"]
@@ -89,7 +89,7 @@ def pinocchio_frames(oracle, q):
 
 @pytest.fixture(scope="module")
 def solvers(robot):
-    """In the virtual machine: every combination of kinds would be compiled else."""
+    """Solvers in the virtual machine, because every combination of kinds needs a kernel."""
     return {name: ik.Solver(robot, name, TIGHT, compiled=False) for name in METHODS}
 
 
@@ -104,7 +104,7 @@ def test_contact_frames_match_pinocchio(robot, coupled_robot, oracle, coupled_or
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_kind_is_solved(robot, oracle, solvers, method, kind):
-    """The thumb of that kind, the others with point and normal; judged by pinocchio as well."""
+    """The thumb has that kind, the others point and normal; pinocchio verifies the answer."""
     at = frames(robot)
     contacts = {
         name: contact(kind if name == robot.thumb else "point and normal", frame)
@@ -132,7 +132,7 @@ def test_every_kind_is_solved(robot, oracle, solvers, method, kind):
     ],
 )
 def test_free_components_have_no_rows(robot, rng, method, tolerance, min_solved, free):
-    """Solved, and the log measures nothing of it."""
+    """Free components are solved, and the log has no error of them."""
     points, normals = robot.contacts(robot.random(rng, 120))
     rows, finger = np.arange(120), rng.integers(0, 3, 120)
     if free == "finger":
@@ -165,7 +165,7 @@ def test_free_components_have_no_rows(robot, rng, method, tolerance, min_solved,
 
 @pytest.mark.parametrize("method", METHODS)
 def test_full_poses_of_all_fingers(robot, oracle, solvers, method):
-    """More is asked than the hand has joints for, so from the configuration that has them."""
+    """All fingers have poses, more than the hand has joints for, taken from a configuration."""
     at = frames(robot)
     contacts = dict(zip(robot.fingers, (contact("pose", frame) for frame in at), strict=True))
     solution = solvers[method].solve(ik.Grasp(contacts))
@@ -208,7 +208,7 @@ def test_answers_are_independent_of_other_targets(robot, solvers, method):
 
 
 def test_batch_of_directions_only(robot, solvers):
-    """Beside points and normals, with the answers that grasps get; the thumb's point is free."""
+    """Directions are solved beside points and normals, with the answers of single grasps."""
     at = np.array([frames(robot, seed) for seed in range(3)])
     points, normals = at[..., :3, 3].copy(), at[..., :3, 0].copy()
     directions = np.full_like(normals, np.nan)
@@ -251,7 +251,7 @@ def test_rows_of_a_log_belong_to_their_solves(robot, solvers, tmp_path: Path):
 
 
 def test_log_contains_the_targets(robot, solvers, tmp_path: Path):
-    """And asked again it has the same answer."""
+    """The logged target has the same answer when it is solved again."""
     kinds = dict(zip(robot.fingers, ("plane and pose", "line", "direction"), strict=True))
     grasp = ik.Grasp(
         {
@@ -295,7 +295,7 @@ def test_log_contains_the_targets(robot, solvers, tmp_path: Path):
 
 
 def test_unsolved_pose_is_explained(robot, oracle, solvers):
-    """The diagnosis asks with tangents as well: what helps is to leave one free."""
+    """The diagnosis includes tangents: leaving one free is the remedy."""
     at = frames(robot)
     normals, tangents = at[:, :3, 0], at[:, :3, 1].copy()
     tangents[1] = np.cos(1.2) * tangents[1] + np.sin(1.2) * np.cross(normals[1], tangents[1])
@@ -368,7 +368,7 @@ def test_bad_grasp_files(tmp_path: Path, thumb, message):
 
 
 def test_bad_arrays(robot, solvers):
-    """The row and finger are named, whichever of several is wrong."""
+    """The error names row and finger."""
     usual = np.repeat(frames(robot)[None], 5, axis=0)
     points, normals, tangents = (usual[:, :, :3, i].copy() for i in (3, 0, 1))
     solver, lone = solvers["hand-first"], normals.copy()

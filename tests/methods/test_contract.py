@@ -1,4 +1,4 @@
-"""What every method promises on every shipped robot."""
+"""Contract of every method on every shipped robot."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import casadi_ik as ik
 
 ROBOTS = ik.shipped_names("arm_hands")
 SLOW = {("original-dls", "baxter_ar10"), ("original-sdls", "baxter_ar10")}
-"""A hierarchy of ten contact tasks on 17 motors: minutes to compile, and never at the contacts."""
+"""Cases with a hierarchy of ten contact tasks on 17 motors, which takes minutes to compile."""
 
 CHOOSING = ("hand-first", "thumb-first")
-"""Methods that take the nearest of several solutions."""
+"""Methods that return the nearest of several solutions."""
 
 
 CASES = [(m, r) for m in ik.METHODS for r in ROBOTS if (m, r) not in SLOW]
@@ -27,7 +27,7 @@ CASES += [("hand-first", body) for body in MULTI_ARM_ROBOTS]
 
 @dataclasses.dataclass
 class Case:
-    """A method on a robot and a few of its targets."""
+    """Method on a robot, with a few targets."""
 
     robot: ik.ArmHand
     method: str
@@ -37,18 +37,18 @@ class Case:
     solvers: dict
 
     def solver(self, **options) -> ik.Solver:
-        """A solver, built once per set of options."""
+        """Return a solver, built once per set of options."""
         key = repr(sorted(options.items()))
         if key not in self.solvers:
             self.solvers[key] = self.fresh_solver(**options)
         return self.solvers[key]
 
     def fresh_solver(self, **options) -> ik.Solver:
-        """A solver of its own."""
+        """Return a new solver."""
         if self.method in PAPER_METHODS:
             options = {"finger_step": "closed-form"} | options
         if self.method.startswith("original"):
-            # They swing for thousands of iterations; what is promised shows in fewer.
+            # They oscillate for thousands of iterations; fewer suffice for the contract.
             options = {"options": {"max_iterations": 500}} | options
         return ik.Solver(self.robot, self.method, **options)
 
@@ -60,7 +60,7 @@ SLOW_CASES = {("hand-first", "two_pandas+allegro"), ("hand-first", "two_ur10e+le
 SLOW_CASES |= {(f"{kind}-sdls", "kuka_lwr_barrett") for kind in ("enhanced", "original")}
 SLOW_CASES |= {("original-sdls", "kuka_lwr_barrett_coupled")}
 SLOW_CASES |= {("ipopt", "baxter_ar10")}
-"""Cases that `make test` leaves to another method on the robot, or another robot of the method."""
+"""Cases that `make test` leaves out, because others cover their method and their robot."""
 
 
 @pytest.fixture(
@@ -144,7 +144,7 @@ def test_fields_of_a_batch(case):
 
 
 def test_success_matches_pinocchio(case):
-    """The verdict recomputed from q alone through the written URDF, both readings of limits."""
+    """Pinocchio recomputes the verdict from q and the written URDF, with and without limits."""
     oracle = PinocchioRobot(case.robot)
     for limits in ("enforce", "ignore"):
         batch = case.solver(limits=limits).solve_batch(case.points, case.normals)
@@ -165,7 +165,7 @@ def test_the_same_seed_gives_the_same_answer(case):
 
 def test_a_batch_is_its_single_solves(case):
     solver = case.solver()
-    # A Contact makes its normal unit once more, which may move the last bit.
+    # A Contact normalises its normal again, which may change the last bit.
     points, normals = case.grasp().arrays(case.robot.fingers)
     batch = solver.solve_batch(points[None], normals[None], seed=2)
     single = solver.solve(case.grasp(), seed=2)
@@ -182,7 +182,7 @@ def test_a_batch_is_its_single_solves(case):
 
 
 def test_lanes_match_single_solves(case):
-    """No line of any method's code is refused by the rewriting, and on one robot it is run."""
+    """The code of every method can be vectorised, and one robot runs it in lanes."""
     options = {"finger_step": "closed-form"} if case.method.startswith("enhanced") else {}
     kernel = getattr(
         ik.solve.registry.build_method(case.method, case.robot.description, options), "kernel", None
@@ -227,7 +227,7 @@ def test_starts_row_by_row(case):
 
 
 def test_solved_start_is_returned(case):
-    """But for the paper's methods, which stand as the paper has them: they begin by moving."""
+    """All methods but those of the paper, which start with a move, return a start that solves."""
     if case.method in PAPER_METHODS:
         pytest.skip("the paper's method reaches with the thumb first, wherever it is")
     batch = case.solver().solve_batch(case.points, case.normals, q0=case.q)
@@ -244,7 +244,7 @@ def test_an_empty_batch(case):
 
 
 def test_unreachable_contacts_have_a_status(case):
-    # It begins anew fifty times before it gives up; what it says then shows after three.
+    # The default is 50 restarts; three show the status.
     options = {"options": {"restarts": 3}} if case.method == "ipopt" else {}
     solver = case.solver(**options)
     solution = solver.solve_batch(case.points[:1] + 10.0, case.normals[:1])

@@ -1,4 +1,4 @@
-"""The flagship: every reachable target solved, alone as in a batch, compiled or not."""
+"""Hand-first solves every reachable target, alone and in batches, compiled or not."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def exact(robot):
 
 
 def test_targets_with_a_joint_next_to_its_limit(robot, exact, rng):
-    """Swivel intervals of a few thousandths of a degree: no sampling would find them."""
+    """Swivel intervals of a few thousandths of a degree are found, which sampling would miss."""
     q = robot.random(rng, 400)
     joint = rng.integers(0, 7, len(q))
     side = rng.integers(0, 2, len(q)).astype(bool)
@@ -27,7 +27,7 @@ def test_targets_with_a_joint_next_to_its_limit(robot, exact, rng):
     q[rows, joint] = np.where(side, robot.lower[joint] + margin, robot.upper[joint] - margin)
     batch = exact.solve_batch(*robot.contacts(q))
     assert batch.success.all()
-    # Most of them without the whole-system stage: the closed form found the interval.
+    # Most of them skip the whole-system stage, because the closed form has found the interval.
     assert np.mean(batch.phases["refinement"] == 0) > 0.9
 
 
@@ -37,7 +37,7 @@ def test_without_limits_everything_is_solved_too(robot, rng):
 
 
 def test_unreachable_contacts_are_approached(robot, exact, rng):
-    """Not solved; what comes back is finite, within limits and stretched towards the target."""
+    """An unsolved answer is finite, within limits and stretched towards the target."""
     points, normals = robot.contacts(robot.random(rng, 20))
     offsets = points.mean(axis=1, keepdims=True)
     points = points + 2.0 * offsets / np.linalg.norm(offsets, axis=2, keepdims=True)
@@ -50,7 +50,7 @@ def test_unreachable_contacts_are_approached(robot, exact, rng):
 
 @pytest.mark.slow
 def test_optimisation_changes_no_bit(robot, rng, monkeypatch):
-    # One after the other with an arm, many at once without: each compiles the shorter half.
+    # Each order compiles only one of the two kernels: single solves for arms, lanes for hands.
     hand = ik.load_robot("ar10")
     with_arm = robot.contacts(robot.random(rng, 20))
     single_points = hand.contacts(hand.random(rng, 100))
@@ -91,13 +91,13 @@ def test_uncompiled_restart_is_the_same(tmp_path, rng, offset):
         if prefer == "limits":  # of several that are near, the last places of a sine may decide
             np.testing.assert_allclose(fast.q, slow.q, atol=1e-7)
         statuses |= {name for name, count in fast.phases.items() if count.any()}
-    # Few targets come to a balance, which the tolerant fits precede.
+    # Few targets reach the balance, which follows the tolerant fits.
     assert statuses | {"balance"} == set(fast.phases) - ({"arm-choice"} if offset else set())
 
 
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
 def test_unreachable_targets_end_the_same_alone_and_in_a_batch(ar10, rng, prefer):
-    """All rounds are made for it."""
+    """All restarts are made for an unreachable target."""
     points, normals = ar10.contacts(ar10.random(rng, 6))
     points = points + rng.normal(0, 0.008, points.shape)
     solver = ik.Solver(ar10)

@@ -1,4 +1,4 @@
-"""Motors that are held: wherever they stand within their limits, no reachable target is lost."""
+"""Fixed motors: wherever they are within limits, no reachable target is missed."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_every_motor_can_be_fixed(robot, rng, method, limits, min_solved):
     ],
 )
 def test_joint_can_be_fixed_in_another_turn(name, fixed, prefer):
-    """A form of the arm gives each joint in the middle turn of its range."""
+    """An arm family gives each joint in the middle turn of its range."""
     assert all_solved(ik.load_robot(name), fixed, prefer)
 
 

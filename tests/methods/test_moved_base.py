@@ -33,7 +33,7 @@ ROBOTS = {
     "two_arms": (PAIR, ("batch", "single", "choose", "palms")),
     "mobile_arm": (MOBILE, ("batch", "single")),
 }
-"""Robots, and their calls: of a body each of the others takes about 10 s of a compiler."""
+"""Robots and their calls: of a multi-arm robot, each other call takes about 10 s of compilation."""
 
 
 class Questions:

@@ -1,4 +1,4 @@
-"""Hand first on bodies: all hands, arms and the trunk as one problem."""
+"""Hand-first on multi-arm robots: all hands, arms and the trunk as one problem."""
 
 from pathlib import Path
 
@@ -47,7 +47,7 @@ def test_reachable_targets_are_solved(robot, is_near_home):
     for tolerance in (ik.Tolerance(), FINE):
         batch = ik.Solver(robot, tolerance=tolerance).solve_batch(points, normals)
         assert np.all(batch.status == ik.Status.SOLVED)
-        # By the robot itself, whatever the solver says.
+        # Verified by the robot's kinematics.
         assert misses(robot, batch.q, points).max() <= tolerance.position * 1.001
         assert np.all((batch.q >= robot.lower - 1e-9) & (batch.q <= robot.upper + 1e-9))
 
@@ -96,7 +96,7 @@ def test_nearby_solutions_are_preferred(robot):
 
 @pytest.mark.parametrize("name", ["two_pandas+allegro", "g1+dex3"])
 def test_self_collision_free_solutions_are_found(name):
-    """Fingers of a hand touch each other, arms each other, and a hand the body."""
+    """Fingers of a hand, the arms, and a hand and the torso may touch each other."""
     robot = ik.load_robot(name)
     solver, any_grasp, q_touching = ik.Solver(robot, scene=ik.Scene()), grasp(robot, robot.home), []
     for seed in range(30):
@@ -110,7 +110,7 @@ def test_self_collision_free_solutions_are_found(name):
     solved = batch.success
     assert (solver.check(batch.q[solved], any_grasp).distance >= 0).all()
     assert misses(robot, batch.q, points)[solved].max() <= 5e-3 * 1.001
-    # Few of them come by themselves.
+    # Few answers are free of collision without the search.
     first = ik.Solver(robot).solve_batch(points, normals).q
     assert (solver.check(first, any_grasp).distance < 0).mean() > 0.1
 
@@ -145,7 +145,7 @@ def test_manipulability_is_the_minimum_over_arms(robot):
 
 
 def measure(robot, q, side, arm):
-    """Yoshikawa's measure of a side's arm, its Jacobian by differences of palms."""
+    """Return Yoshikawa's manipulability of a side's arm, by differences of palms."""
     pose, step, columns = robot.palm(q, side), 1e-6, []
     for motor in arm:
         pose_after = robot.palm(np.where(np.arange(len(q)) == motor, q + step, q), side)
@@ -174,15 +174,15 @@ def test_barely_unreachable_targets_end_early(name):
     out /= np.linalg.norm(out, axis=1)[:, None]
     while (batch := solver.solve_batch(points, normals)).success.any():
         points[np.ix_(batch.success, side)] += 0.05 * out[batch.success, None]
-    # Each trunk takes about 30; before 300,000 was the rule.
+    # Each trunk takes about 30 iterations; before, all together took 300,000.
     assert np.median(batch.iterations) < 150_000
 
 
 def test_distant_targets_end_immediately(robot):
-    """Also where contacts leave palms a freedom, and of one arm on a trunk."""
+    """Distant targets end at once also with free palms, and for one arm on a trunk."""
     _, points, normals = targets(robot, 4)
     batch = ik.Solver(robot).solve_batch(points + np.array([3.0, 0.0, 0.0]), normals)
-    # All trunks and rounds took two Pandas 158,000 before.
+    # Before, all trunks and restarts of two Pandas took 158,000 iterations.
     assert batch.iterations.max() < 120_000
 
 
@@ -350,7 +350,7 @@ def test_hands_approach_and_lift_together(sides):
     tips = robot.contacts(q)[0]
     points = np.array([grasp_near_home.contacts[name].point for name in fingers])
     assert np.allclose(tips[-1][rows], points + np.array([0, 0, 0.1]), atol=2e-3)
-    # What both hold keeps its place in both hands while it is lifted.
+    # While it is lifted, the object keeps its place in both hands.
     lifted_tips = tips[parts == "lifting"][:, rows]
     assert np.abs(lifted_tips - lifted_tips[:, :1] - (points - points[0])).max() < 2e-3
     came = tips[parts == "coming"][0][rows] - points

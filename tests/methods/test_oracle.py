@@ -1,4 +1,4 @@
-"""Reachable targets of all samplers are solved; numpy alone checks every solution."""
+"""Reachable targets of all samplers are solved, verified in numpy alone."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SETS += [
         ("random", None),
     )
 ]
-"""Robot, sampler, number of targets and fingers with a contact (None: all) of each set."""
+"""Robot, sampler, number of targets and of fingers with a contact (None: all) of each set."""
 
 
 @pytest.mark.parametrize("tolerance", TOLERANCES, ids=str)
@@ -39,7 +39,7 @@ def test_targets_are_solved_and_answers_verified(name, sampler, count, fingers, 
     batch = ik.Solver(robot, tolerance=ik.Tolerance(*tolerance)).solve_batch(points, normals)
     assert np.flatnonzero(~batch.success).tolist() == []
     points_reached, faced = numpy_oracle.contacts(robot, batch.q)
-    # Rounding: of two kinds of arithmetic over a chain of a metre, and of the verdict's own slack.
+    # Rounding of two kinds of arithmetic over a chain of a metre, and the slack of the verdict.
     distance = np.linalg.norm(points_reached - points, axis=2)
     np.testing.assert_array_equal(np.isnan(distance), np.tile(free, (count, 1)))
     assert np.nanmax(distance) <= tolerance[0] * (1 + 1e-6)

@@ -1,4 +1,4 @@
-"""The thumb-first method: it solves from one start, within limits, and its trace says how."""
+"""The thumb-first method solves from one start, within limits, with a truthful trace."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DEFAULT_TOLERANCE = ik.Tolerance()
 
 
 STARTS = 32
-"""Starts of a solve, unless it is told."""
+"""Default number of starts of a solve."""
 
 
 def thumb_first(
@@ -36,7 +36,7 @@ def single_start(robot) -> ik.Solver:
 
 
 def bent(robot, rng, count):
-    """The shipped grasps' hands with the distal joints at 25 to 45 deg, on random arms."""
+    """Return hands of the shipped grasps with distal joints at 25 to 45 deg, on random arms."""
     q = shipped_hands(robot, rng, count)
     distal = [i for i, name in enumerate(robot.actuators) if name.endswith("_distal")]
     q[:, distal] = np.radians(rng.uniform(25, 45, (count, len(distal))))
@@ -59,7 +59,7 @@ def test_single_start_usually_suffices(robot, single_start, rng, hands):
             for hands in (shipped_hands, bent)
             for tolerance in (DEFAULT_TOLERANCE, EXACT)
         ),
-        # Hands that are no grasps.
+        # Hand postures that are not grasps.
         (ik.ArmHand.random, DEFAULT_TOLERANCE, 0.995),
         (ik.ArmHand.random, EXACT, 0.98),
     ],
@@ -77,7 +77,7 @@ def test_limits_ignored(robot, rng):
 
 
 def test_nearest_solution_is_chosen(robot, solver, rng):
-    """Such targets once moved as far as without a start, and some were not solved."""
+    """The answers once were as far from q0 as without it, and some targets were missed."""
     q, q0 = robot.random(rng, 400), robot.random(rng, 400)
     targets = robot.contacts(q)
     near_batch = solver.solve_batch(*targets, q0=q0)
@@ -97,7 +97,7 @@ def test_nearest_solution_is_chosen(robot, solver, rng):
 
 
 def test_slightly_inconsistent_contacts_are_balanced(robot, solver, rng):
-    """71 % of them were solved."""
+    """Before, 71 % of them were solved."""
     points, normals = robot.contacts(robot.random(rng, 500))
     points = points + rng.normal(0, 4e-3, points.shape)
     normals = normals + rng.normal(0, np.radians(2), normals.shape)
@@ -117,7 +117,7 @@ def test_unreachable_targets_keep_the_best(robot, solver, rng):
 
 
 def test_the_start_chooses_between_hands(robot, single_start, rng):
-    """Of several hands for the same contacts, the search starts with the one near q0."""
+    """The search starts with the hand near q0 when several hands have the same contacts."""
     q = robot.random(rng, 200)
     around = np.clip(q + rng.normal(0, 0.3, q.shape), robot.lower, robot.upper)
     starts = (robot.home, around)
@@ -135,7 +135,7 @@ def test_palm_is_fixed_without_an_arm(coupled_robot, rng):
 
 
 def test_proxqp_solves_equally_well(robot, single_start, rng):
-    """The quadratic program takes the same way: nothing is lost by fixing joints one by one."""
+    """The quadratic program gives the same result: fixing joints one by one loses nothing."""
     targets = robot.contacts(shipped_hands(robot, rng, 60))
     program = thumb_first(robot, starts=1, step="proxqp")
     single_batch, program_batch = single_start.solve_batch(*targets), program.solve_batch(*targets)

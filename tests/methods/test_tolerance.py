@@ -1,4 +1,4 @@
-"""Targets that are met only within their tolerance, by every call of a solver."""
+"""Targets that are met only within their tolerance are solved by every call of a solver."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from casadi_ik.solve.registry import build_method
 @pytest.mark.parametrize("degrees", [10.0, 30.0])
 @pytest.mark.parametrize("prefer", ["limits", "q0"])
 def test_displaced_targets_are_solved_in_a_batch(robot, degrees, prefer):
-    """The exact fit alone lost up to 80 % of them."""
+    """The exact fit alone missed up to 80 % of them."""
     tolerance = ik.Tolerance(0.005, np.radians(degrees))
     rng = np.random.default_rng(7)
     contacts = robot.contacts(robot.random(rng, 500))
@@ -58,7 +58,7 @@ def displaced_palms(robot, q, tolerance, part):
 @pytest.mark.slow
 @pytest.mark.parametrize("degrees", [10.0, 30.0])
 def test_an_arm_of_five_axes_reaches_palm_poses_within_tolerance(degrees):
-    """Exact poses are out of its reach; it solved 2 to 9 of 20."""
+    """Exact poses are out of reach of the arm; 2 to 9 of 20 were solved."""
     robot = with_fixed_motor(ik.load_robot("viperx_300s+so100_jaw"), "vx300s_joint_4")
     tolerance = ik.Tolerance(0.005, np.radians(degrees))
     q = robot.random(np.random.default_rng(7), 20)
@@ -88,7 +88,7 @@ def test_palms_of_an_arm_with_limits_are_solved_within_tolerance(robot):
 
 
 def test_the_loop_has_a_queue_for_every_stage():
-    """The loop had twelve queues for every method; lanes then mixed stages."""
+    """The loop had twelve queues for every method, so that lanes mixed stages."""
     body = ik.load_robot("two_pandas+allegro").description
     method: Any = build_method("hand-first", body, {})
     stages = method.graph.function

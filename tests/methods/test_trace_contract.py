@@ -1,4 +1,4 @@
-"""The standard fields of a trace: every method has them, they are true, and events follow."""
+"""Standard fields of traces: every method has them, their values are true, and events follow."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ METHODS: Mapping[str, tuple[set[StandardField], dict[str, Any]]] = {
     "original-sdls": (set(), PAPER_OPTIONS),
     "ipopt": ({COST, RESTART}, {"restarts": 2}),
 }
-"""Of each method: which optional fields it records, and options that keep the runs short."""
+"""Optional fields that each method records, and options that keep the runs short."""
 
 
 def run(robot: ik.ArmHand, method: str) -> SolveBlock:
-    """From near home to out of reach: shipped grasps, random, at limits and singular."""
+    """Return shipped grasps and random targets, at limits, singular, and out of reach."""
     rng = np.random.default_rng(12)
     grasps = random_arm_targets(robot, ("cup", "mug"), 4, rng)
-    # The original methods converge from next to the target only.
+    # The original methods converge only from near the target.
     q_near = robot.home + rng.normal(size=(4, len(robot.home))) * [[0.02], [0.02], [1e-3], [1e-3]]
     hard = (random_hands, near_limits_on_aligned_arms, aligned_arms)
     q = [np.clip(q_near, robot.lower, robot.upper), *(draw(robot, rng, 6) for draw in hard)]
@@ -70,7 +70,7 @@ def run(robot: ik.ArmHand, method: str) -> SolveBlock:
 
 
 def join_blocks(blocks: list[SolveBlock]) -> SolveBlock:
-    """Blocks of one method as one."""
+    """Return the blocks of one method as one block."""
     return dataclasses.replace(
         blocks[0],
         targets=dataclasses.replace(
@@ -86,7 +86,7 @@ def join_blocks(blocks: list[SolveBlock]) -> SolveBlock:
 
 @pytest.fixture(scope="module")
 def blocks(robot) -> dict[str, SolveBlock]:
-    """A seeded run of every method on the shipped robot."""
+    """Seeded run of every method on the shipped robot."""
     return {method: run(robot, method) for method in ik.METHODS}
 
 
@@ -144,12 +144,12 @@ def test_field_of_another_type_is_refused(robot, blocks, field):
 
 
 def test_every_kind_of_event_is_produced(blocks):
-    """Each kind by some method: names that differ between methods and events would hide one."""
+    """Each kind of event occurs for some method."""
     event_counts = {}
     for method, block in blocks.items():
         events = logs.detect_events(block.format, block.rows, block.batch.iterations)
         event_counts[method] = {logs.EventKind(kind) for kind in np.unique(events["kind"])}
-    # Collisions are of a log with a scene: tests/logs/test_log_collisions.py.
+    # Collisions need a log with a scene: tests/logs/test_log_events.py.
     with_scene = {logs.EventKind.COLLISION_ENTERED, logs.EventKind.COLLISION_LEFT}
     assert set.union(*event_counts.values()) == set(logs.EventKind) - with_scene
     assert {

@@ -1,4 +1,4 @@
-"""The nearest answer counts full turns, and a joint without limits has no border."""
+"""The nearest answer counts full turns, and joints without limits have no border."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ BASE, WRIST = 0, 5
 """Joints without limits: the first and the last one of the arm."""
 
 SHOULDER = 1
-"""A joint with limits, two turns apart."""
+"""A joint with limits of plus and minus two turns."""
 
 Q = np.array([0.4, -1.2, 1.1, -0.6, -1.3, 0.5])
 
 
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory) -> ik.ArmHand:
-    """A UR5e with a three-finger hand, two of its joints without limits."""
+    """UR5e with a three-finger hand, two of its joints without limits."""
     names = "ur5e_joint_1", "ur5e_joint_6"
     folder = tmp_path_factory.mktemp("turns")
     return on_pedestal(ik.load_robot("ur5e+dclaw"), folder, continuous=names)
@@ -29,7 +29,7 @@ def robot(tmp_path_factory) -> ik.ArmHand:
 
 @pytest.fixture(scope="module")
 def solver(robot) -> ik.Solver:
-    """A solver without a scene."""
+    """Solver without a scene."""
     return ik.Solver(robot)
 
 

@@ -1,4 +1,4 @@
-"""Stages of hand-first in the virtual machine: chosen as by the C code of an iteration."""
+"""The virtual machine selects stages of hand-first like the C code."""
 
 from collections import Counter
 from dataclasses import replace

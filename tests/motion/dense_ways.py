@@ -1,4 +1,4 @@
-"""Straight ways looked at closely: what is free between postures, by samples."""
+"""Dense samples of straight paths between postures."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 
 STRIDE = 0.02
-"""Longest step of a motor between two of them, in its units."""
+"""Longest step of a motor between two samples, in its units."""
 
 
 def dense(corners, units):
-    """(k, n) postures on the straight ways from corner to corner (m, n)."""
+    """Return postures (k, n) on the straight paths from corner to corner (m, n)."""
 
     def between(start, end):
         count = max(2, math.ceil(float(np.max(np.abs(end - start) / units)) / STRIDE) + 1)

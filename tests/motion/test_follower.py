@@ -1,4 +1,4 @@
-"""A follower: limits are kept whatever the targets do, and smooth targets are followed exactly."""
+"""A follower keeps limits for any targets, and follows smooth targets exactly."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROUNDING = 1e-9
 
 
 def check_limits(robot, follower, q):
-    """Positions, velocities and accelerations of (k, n), the robot at rest before the first."""
+    """Assert limits of positions, velocities and accelerations of (k, n), from rest."""
     assert (q >= robot.lower).all()
     assert (q <= robot.upper).all()
     steps = np.diff(q, axis=0)
@@ -87,7 +87,7 @@ def test_limits_are_kept_for_any_targets(robot, solver, seed, events):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_jumping_target_is_reached_at_rest(robot, solver, seed):
-    """Without going past it: every motor turns back never."""
+    """The target is reached without overshoot: no motor reverses."""
     rng = np.random.default_rng(seed)
     start = 0.7 * robot.home + 0.3 * robot.random(rng, 1)[0]
     end = start + 0.15 * (robot.random(rng, 1)[0] - start)
@@ -154,7 +154,7 @@ def test_out_of_reach_and_back(robot, solver):
 
 
 def test_fingertips_alone_and_a_wrist(robot, solver):
-    """Positions are met exactly; the wrist comes as near as they leave it free."""
+    """Positions are met exactly; the wrist comes as near as they permit."""
     end = robot.home + 0.1
     points, _ = robot.contacts(end)
     palm = robot.palm(end)
@@ -185,7 +185,7 @@ def test_another_branch_on_request(robot, solver):
 
 
 def test_contacts_of_other_kinds(robot, solver):
-    """A whole pose, and a point anywhere on a line: the graph of those kinds goes on."""
+    """Contacts may be a whole pose, and a point on a line."""
     end = robot.home + 0.05
     frames = robot.contact_frames(end)
     contacts = {

@@ -1,4 +1,4 @@
-"""A follower and a path with a scene: nothing that stands still is ever touched."""
+"""Followers and paths in a scene never touch a resting obstacle."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_jumping_targets_cause_no_contact(robot, solver, seed):
 
 
 def led_through_each_other(body, shares):
-    """Contacts of both hands on the way to the other's place, so far each."""
+    """Return contacts of both hands on the way to each other's place, at these fractions."""
     points, normals = body.contacts(body.home)
     rows = [
         [body.fingers.index(finger) for finger in side.fingers] for side in body.description.sides
@@ -93,7 +93,7 @@ def led_through_each_other(body, shares):
 
 @pytest.mark.slow
 def test_hands_led_through_each_other_do_not_touch():
-    """The hands stop before each other, and follow again on the way back."""
+    """The hands stop in front of each other, and follow again on the way back."""
     body = ik.load_robot("g1+dex3")
     solver = ik.Solver(body, scene=ik.Scene())
     plain, careful = ik.Solver(body).follow(body.home, PERIOD), solver.follow(body.home, PERIOD)
@@ -113,7 +113,7 @@ def test_hands_led_through_each_other_do_not_touch():
 @pytest.mark.slow
 @pytest.mark.parametrize("period", [0.001, 0.01])
 def test_motors_stop_where_clearance_is_missing(period):
-    """Nearly all pairs of links within a hand are nearer than the clearance that is kept."""
+    """Nearly all pairs of links within a hand are nearer than the kept clearance."""
     body = ik.load_robot("g1+dex3")
     solver = ik.Solver(body, scene=ik.Scene())
     rng, second = np.random.default_rng(11), round(1 / period)
@@ -127,7 +127,7 @@ def test_motors_stop_where_clearance_is_missing(period):
 
 
 def test_blocked_arm_slows_its_own_side():
-    """Hands leap to where a turned waist has them; the right shoulder would touch the torso."""
+    """Hands jump to where a turned waist has them; the right shoulder would touch the torso."""
     body = ik.load_robot("g1+dex3")
     q = body.home.copy()
     q[body.actuators.index("waist_yaw_joint")] = 0.4
@@ -157,7 +157,7 @@ def clearances_around(solver):
 
 
 def test_a_path_keeps_clear(robot, solver):
-    """Down to the table and beyond: solved as far as that is free, never nearer than the margin."""
+    """The target passes down through the table; the hand never comes nearer than the margin."""
     points, normals = robot.contacts(robot.home)
     low = points[:, 2].min()
     moving = [
@@ -170,14 +170,14 @@ def test_a_path_keeps_clear(robot, solver):
     assert track.clearance is not None
     assert clearances(solver, track.q).free.all()
     np.testing.assert_allclose(track.clearance, clearances(solver, track.q).distance)
-    # Between the postures, too, as far as that is looked into.
+    # The path is free between the postures, too, up to the checked resolution.
     assert track.free_between is not None
     assert track.free_between.all()
     assert clearances(solver, dense(track.q, motor_units(robot))).surplus.min() >= -PATH_RESOLUTION
 
 
 def test_obstacle_between_free_postures_is_detected(robot):
-    """A thin pole that the arm sweeps through, and a ball that is carried through the robot."""
+    """A thin pole is in the sweep of the arm, and a ball moves through the robot."""
     q_path = np.tile(robot.home, (3, 1))
     q_path[:, 0] += [-0.7, 0.7, 0.72]
     x, y, z = robot.palm(robot.home)[:3, 3]
@@ -212,7 +212,7 @@ def test_free_path_is_followed_as_without_a_scene(robot, solver):
 
 
 def test_free_motions_avoid_collisions_of_followed_postures():
-    """The contacts are those of postures that mostly collide; the robot can hold them otherwise."""
+    """The contacts are from postures that mostly collide, but other postures can hold them."""
     robot = ik.load_robot("g1+dex3")
     solver = ik.Solver(robot, scene=ik.Scene())
     path = smooth_path(robot, 1, 1500, 1e-3, 0.3)

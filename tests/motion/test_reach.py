@@ -1,4 +1,4 @@
-"""The way to a grasp: from rest to rest, within limits, free between its points, ending in it."""
+"""The approach to a grasp: from rest to rest, within limits, free between samples, ending in it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def grasp() -> ik.Grasp:
 
 
 def sent(motion):
-    """Largest first and second differences (n,) of what is sent, at rest before and after."""
+    """Return the largest first and second differences (n,) of commands from rest to rest."""
     (period,) = set(np.diff(motion.times).round(12))
     q = np.concatenate([motion.q[:1], motion.q, motion.q[-1:]])
     return (
@@ -46,7 +46,7 @@ def check_motion(robot, grasp, reach_motion, q0):
     assert not motion.velocity[[0, -1]].round(6).any()
     steps = np.diff(motion.times)[:, None]
     assert (steps > 0).all()
-    # What stands there of rates is what the motion does.
+    # The stated rates are those of the motion.
     between = np.diff(motion.q, axis=0) / steps
     off = np.abs(between - (motion.velocity[1:] + motion.velocity[:-1]) / 2)
     assert (off <= 0.6 * rates.acceleration * steps).all()
@@ -79,7 +79,7 @@ def test_approach_is_straight_and_then_closes(robot, grasp, scene):
     [("tennis_ball", 0.01), ("apple", 0.004), ("tomato_soup_can", 0.02), ("cup", 0.05)],
 )
 def test_motion_keeps_velocity_and_acceleration_limits(robot, name, period):
-    """Closing passes corners, where joints come to limits; the figures are measured."""
+    """Joints reach limits at corners; the figures are measured."""
     motion = ik.Solver(robot).reach(ik.load_grasp(name), period=period)
     velocity, acceleration = sent(motion.motion)
     rates = rates_of(robot, None, None)
@@ -90,7 +90,7 @@ def test_motion_keeps_velocity_and_acceleration_limits(robot, name, period):
 
 
 def test_short_and_kinked_paths_are_timed(robot):
-    """Steps of a ten-millionth and of a third, of all motors or one; ways to and fro."""
+    """Steps range from a ten-millionth to a third, of all motors or one, also back and forth."""
     rng, rates = np.random.default_rng(0), rates_of(robot, None, None)
     for size in (1e-7, 1e-4, 1e-2, 0.3):
         for moving in (1, 14):
@@ -104,7 +104,7 @@ def test_short_and_kinked_paths_are_timed(robot):
 
 
 def test_clearance_holds_between_samples(robot):
-    """A ball beside the way, passed between two samples that are far apart."""
+    """A ball beside the path is detected between two distant samples."""
     grasp = ik.Grasp(ik.load_grasp("cup").contacts)
     path = ik.Solver(robot).reach(grasp).motion
     going = path.q[path.notes["part"] == "going"]
@@ -127,7 +127,7 @@ def test_clearance_holds_between_samples(robot):
 
 
 def test_path_leads_around_an_obstacle(robot):
-    """A ball where the straight way leads: OMPL goes around it."""
+    """OMPL avoids a ball on the straight path."""
     start = robot.home + 1.6 * (np.arange(14) == 0)
     ends = np.stack([start, robot.home])
     place = robot.palm(ends.mean(axis=0))[:3, 3]
@@ -170,7 +170,7 @@ def test_unreachable_grasp_is_explained(robot, grasp):
 
 
 def test_blocked_approach_uses_another_direction(robot, grasp):
-    """A lid over the object; from the side it can be reached."""
+    """With a lid over the object, the hand approaches from the side."""
     points, _ = grasp.arrays(robot.fingers)
     place = (points.mean(axis=0) + np.array([0.0, 0.0, 0.25])).tolist()
     lid = {"lid": {"kind": "box", "size": [0.6, 0.6, 0.02], "xyz": place}}
@@ -199,7 +199,7 @@ def test_motion_is_written_like_a_followed_one(robot, grasp, tmp_path):
 
 
 def test_approach_alone(robot, grasp):
-    """A pre-grasp with open fingers, straight on; in a scene all of it is free, or it is said."""
+    """The hand approaches straight with open fingers; in a scene the path is free or refused."""
     motion = ik.Solver(robot).approach(grasp, distance=0.06, opening=0.015)
     assert (motion.success, motion.reason, motion.clearance) == (True, "", None)
     np.testing.assert_array_equal(motion.pregrasp, motion.coming[0])
@@ -217,7 +217,7 @@ def test_approach_alone(robot, grasp):
 
 
 def test_given_palm_is_reached(robot, grasp):
-    """Fingers open and close about the posture that is held."""
+    """Fingers open and close around the posture of the grasp."""
     solution = ik.Solver(robot).solve(grasp)
     motors = robot.actuators[7:]
     posture = dict(zip(motors, solution.q[7:].tolist(), strict=True))
@@ -256,7 +256,7 @@ def test_chosen_posture_is_reached(robot, grasp, on_table):
 
 
 def test_candidates_follow_the_object(robot, grasp):
-    """The grasps come in the object's frame, the answers in the base frame."""
+    """The grasps are in the object frame, the answers in the base frame."""
     pose = grasp.object_pose
     (choice,) = ik.Solver(robot).choose([grasp.in_object_frame()], object_pose=pose, limit=1)
     for finger, contact in grasp.contacts.items():
@@ -300,7 +300,7 @@ def test_object_moves_with_the_hand(robot, grasp, on_table):
     back = palms[4] - palms[3]
     np.testing.assert_allclose(back, -0.08 * came / np.linalg.norm(came), atol=2e-3)
     assert max(reach_motion.velocity_share, reach_motion.acceleration_share) <= 1
-    # The cup's brim is 30 mm above its middle: a ball that no finger comes near.
+    # The brim of the cup is 30 mm above its middle: no finger comes near a ball there.
     for height, lift, free in ((0.09, 0.1, False), (0.09, 0.04, True), (0.09, 0.0, True)):
         place = (grasp.object_pose[:3, 3] + np.array([0.0, 0.0, height])).tolist()
         ball = {"ball": {"kind": "sphere", "radius": 0.01, "xyz": place}}

@@ -1,4 +1,4 @@
-"""A follower that is stuck after an excursion of its target finds the way back."""
+"""A follower that is stuck after an excursion of its target recovers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PERIOD = 0.01
 
 
 def free_starts(robot, count):
-    """Return postures (count, n) at which the robot does not touch itself."""
+    """Return postures (count, n) without self-collision."""
     careful, rng = ik.Solver(robot, scene=ik.Scene()), np.random.default_rng(7)
     starts = robot.home + 0.5 * (robot.random(rng, 100) - robot.home)
     return starts[clearances(careful, starts).free][:count]

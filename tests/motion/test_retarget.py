@@ -1,4 +1,4 @@
-"""A person's hand moves a robot's: what is configured, what is wanted, what is refused."""
+"""A person's hand moves a robot: configuration, targets, and refusals."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ wrist_weight: 0.02
 
 @pytest.fixture
 def retarget(tmp_path):
-    """Write a retargeting file with these keys; default: thumb and the first two other fingers."""
+    """Function that loads a retargeting file; default: thumb and two other fingers."""
 
     def read(robot=None, **keys):
         if robot is not None:
@@ -75,7 +75,7 @@ def test_missing_finger_is_refused(robot, retarget):
 
 
 def test_motions_are_scaled_and_turned(robot, retarget):
-    """The wrist's way by `travel`, the hand's size by `scaling`, both turned by `rpy`."""
+    """The wrist's path is scaled by `travel`, the hand by `scaling`, both turned by `rpy`."""
     config = retarget(
         fingers={"thumb": 4, "finger_2": 8}, scaling=1.5, travel=2.0, rpy=(0, 0, np.pi / 2)
     )
@@ -96,7 +96,7 @@ def test_motions_are_scaled_and_turned(robot, retarget):
 
 
 def test_first_frame_defines_the_frame(robot, retarget):
-    """Fingertips of a person who holds the hand as the robot does are the robot's own."""
+    """Fingertips of a person who holds the hand like the robot are those of the robot."""
     points, _ = robot.contacts(robot.home)
     palm = robot.palm(robot.home)
     frame = np.random.default_rng(0).normal(size=(21, 3))
@@ -109,7 +109,7 @@ def test_first_frame_defines_the_frame(robot, retarget):
 
 
 def spans(frame, target, robot, config):
-    """Thumb to index finger of a person and of a robot [m]."""
+    """Return the distances between thumb and index finger of a person and of a robot [m]."""
     thumb, index = (name for name, key in config.fingers.items() if key in (4, 8))
     tips = target.points[[robot.fingers.index(thumb), robot.fingers.index(index)]]
     return np.linalg.norm(frame[4] - frame[8]), np.linalg.norm(tips[0] - tips[1])
@@ -117,7 +117,7 @@ def spans(frame, target, robot, config):
 
 @pytest.mark.parametrize("name", ["panda+allegro_right", "kuka_lwr_barrett", "ur5e+robotiq_3f"])
 def test_hand_size_is_measured_when_open(name, retarget):
-    """Neither the robot's posture nor the person's first one counts: a pinch is a pinch."""
+    """The scale is independent of both first postures: a pinch is a pinch."""
     robot = ik.load_robot(name)
     config, place = retarget(robot), np.array([0.3, 0.1, 0.6])
     pinch = hand(0.9, place)
@@ -131,7 +131,7 @@ def test_hand_size_is_measured_when_open(name, retarget):
     assert person == pytest.approx(0.02)
     assert 0.85 < ratios[0] < 1.15
     np.testing.assert_allclose(ratios, ratios[0], rtol=1e-9)
-    # Where the joints between are not seen, the first frame's fingers are taken to be straight.
+    # Without joints between, the fingers of the first frame are assumed to be straight.
     half_seen = hand(0.0, place)
     half_seen[[2, 6, 10, 14, 18]] = np.nan
     retargeter = ik.motion.Retargeter(config, robot)
@@ -141,7 +141,7 @@ def test_hand_size_is_measured_when_open(name, retarget):
 
 
 def seen_by_mediapipe(bend, wrist):
-    """World landmarks of a hand: metres about its own middle."""
+    """Return world landmarks of a hand: metres about its own centre."""
     frame = hand(bend, wrist)
     return frame - frame.mean(axis=0) + [0.004, -0.006, 0.002]
 
@@ -158,12 +158,12 @@ def test_wrist_of_world_landmarks_stays(robot, retarget):
     metric = ik.motion.Retargeter(config, robot)
     for bend, place in bends:
         goes = metric(hand(bend, place))
-    # The fingers are where they are of a hand whose wrist goes.
+    # The fingers are where they are for a moving wrist.
     offsets = [posed_target.points - posed_target.palm[:3, 3] for posed_target in (target, goes)]
     np.testing.assert_allclose(*offsets, atol=1e-9)
     assert np.linalg.norm(goes.palm[:3, 3] - home) > 0.1
     assert not metric.in_hand
-    # Who says how far the wrist goes is believed.
+    # A given scale of the wrist's path is used.
     moving_retargeter = ik.motion.Retargeter(replace(config, travel=1.0), robot)
     palm_points = [
         moving_retargeter(seen_by_mediapipe(*bend_and_place)).palm[:3, 3]
@@ -174,7 +174,7 @@ def test_wrist_of_world_landmarks_stays(robot, retarget):
 
 @pytest.mark.parametrize("size", [0.35, 0.1])
 def test_image_landmarks_are_refused(robot, size, retarget):
-    """Parts of the picture's width and height, depths from the wrist; fingers may be beyond it."""
+    """Image landmarks are fractions of width and height with depths from the wrist."""
     frame = hand(0.3, np.zeros(3)) * size / 0.09 + [0.4, 0.5, 3e-7]
     with pytest.raises(ik.errors.InputError, match=r"landmarks"):
         ik.motion.Retargeter(retarget(robot), robot)(frame)
@@ -202,7 +202,7 @@ def test_a_left_hand_moves_a_right_robot_hand(robot, retarget):
         np.testing.assert_allclose(left_target.palm, expected.palm, atol=1e-9)
         tips, left_tips = (target.points - target.palm[:3, 3] for target in (expected, left_target))
         np.testing.assert_allclose(left_tips @ left_tips.T, tips @ tips.T, atol=1e-9)
-        # Which way round thumb, index and middle finger stand.
+        # The order of thumb, index and middle finger.
         assert np.linalg.det(left_tips) == pytest.approx(np.linalg.det(tips))
         flipped = plain(keypoints)
         flat = flipped.points - flipped.palm[:3, 3]
@@ -210,7 +210,7 @@ def test_a_left_hand_moves_a_right_robot_hand(robot, retarget):
 
 
 def test_smoothing_is_independent_of_the_call_rate(robot, retarget):
-    """A frame at 30 Hz, looked at once or in every cycle of a follower at a kilohertz or two."""
+    """A frame at 30 Hz is used once or in every cycle of a follower at a kilohertz or two."""
     config = replace(retarget(robot), scaling=1.0, low_pass=0.3)
     frames = [hand(0.4, np.array([0.05 * i, 0.0, 0.4])) for i in range(5)]
     ends = []
@@ -249,7 +249,7 @@ def test_nan_frame_is_ignored(robot, retarget):
 
 
 def test_arm_and_hand_follow_a_person(robot, retarget):
-    """A person who moves like the robot is followed by fingertips and wrist at any scale."""
+    """Fingertips and wrist follow a person who moves like the robot, at any scale."""
     excursion = 0.15 * np.sin(np.linspace(0, np.pi, 120))[:, None] * np.sin(np.arange(14))
     path = robot.home + excursion
     fingers = {"thumb": 4, "finger_2": 8, "finger_3": 12}
@@ -278,7 +278,7 @@ def g1():
 
 @pytest.fixture(scope="module")
 def both_hands():
-    """Joints by side, 30 frames a second."""
+    """Keypoints by side, at 30 frames per second."""
     arrays = np.load(KEYPOINTS / "two_hands_box.npz")
     return {side: arrays[f"keypoints_{side}"].astype(float) for side in ("left", "right")}
 
@@ -293,12 +293,12 @@ def test_both_hands_move_a_body(g1, both_hands):
         q.append(follower(target.points, palm=target.palm, palm_weight=(0.05, 0.05)))
         errors.append(np.linalg.norm(g1.contacts(q[-1])[0] - target.points, axis=1))
     assert np.median(errors) < 1e-3
-    # The box goes from side to side: with arms alone it would not.
+    # The box moves from side to side, which arms alone would not do.
     assert np.ptp(np.array(q)[:, g1.actuators.index("waist_yaw_joint")]) > 0.3
 
 
 def test_both_hands_drive_a_body_in_mujoco(g1, both_hands):
-    """Five seconds: springs of 31 motors take the robot where the follower says."""
+    """In five seconds, springs of 31 motors move the robot as the follower commands."""
     mujoco = pytest.importorskip("mujoco")
     spec = mujoco.MjSpec.from_string(g1.urdf())
     spec.compiler.fusestatic = False
@@ -338,7 +338,7 @@ def test_both_hands_drive_a_body_in_mujoco(g1, both_hands):
         mujoco.mj_step(model, data)
         points, _ = g1.contacts(data.qpos[places])
         wrong.append(np.linalg.norm(points - target.points, axis=1).max())
-    # The springs' lag at up to half a metre a second is most of it.
+    # Most of it is the lag of the springs at up to half a metre per second.
     assert np.median(wrong) < 0.01
     assert max(wrong) < 0.05
     assert np.isfinite(data.qpos).all()

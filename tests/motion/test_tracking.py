@@ -1,4 +1,4 @@
-"""A moving grasp: followed without jumps where that can be, within the motors' velocities."""
+"""A moving grasp is followed without jumps where possible, within the motors' velocities."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def largest_step(robot, track) -> float:
 
 
 def smooth_path(robot, seed, count=60):
-    """Between two random configurations not too far apart, within limits."""
+    """Return a path between two random configurations that are not too far apart, within limits."""
     rng = np.random.default_rng(seed)
     start = robot.random(rng, 1)[0]
     middle = (robot.lower + robot.upper) / 2
@@ -44,7 +44,7 @@ def test_it_begins_where_the_robot_is(robot, solver):
 
 
 def test_unavoidable_jump_is_reported(robot, solver):
-    """Joint 7 turns twice, which no arm can follow; every grasp on the way can be reached."""
+    """Joint 7 turns twice, which no arm can follow, but every grasp on the way can be reached."""
     turns = np.linspace(-2 * np.pi, 2 * np.pi, 160)
     path = np.tile(robot.home, (len(turns), 1))
     path[:, 6] = turns
@@ -58,14 +58,14 @@ def test_unavoidable_jump_is_reported(robot, solver):
         assert abs(jump.size) > LEAP * (robot.upper - robot.lower)[i]
         assert set(jump.at_limit) <= set(robot.actuators)
     assert any(jump.at_limit for jump in track.jumps)
-    # Everywhere else it moves less.
+    # Elsewhere it moves less.
     steps = (np.abs(np.diff(track.q, axis=0)) / (robot.upper - robot.lower)).max(axis=1)
     jumped = [jump.index - 1 for jump in track.jumps]
     assert np.delete(steps, jumped).max() < steps[jumped].min()
 
 
 def test_motors_keep_velocities_and_catch_up(robot, solver):
-    """A grasp too fast for the motors is met late, and met again once it stands still."""
+    """A grasp that is too fast for the motors is met late, and again once it stands still."""
     path = smooth_path(robot, 1, count=10)
     path = np.concatenate([path, np.tile(path[-1], (200, 1))])
     velocity, period = 0.2, 0.05
@@ -88,7 +88,7 @@ def test_the_robots_own_velocities(robot, solver):
 
 
 def test_unreachable_grasp_is_approached(robot, solver):
-    """On the way out of the workspace and back: the contacts are missed there and met again."""
+    """The contacts leave the workspace, are missed there, and are met again."""
     points, normals = robot.contacts(robot.home)
     excursion = 0.8 * np.sin(np.linspace(0, np.pi, 40))
     moving = [grasp_of(robot, points - [s, 0, 0], normals) for s in excursion]

@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.opengl]
 FOLDER = Path(__file__).parents[2] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 LARGEST = 3_500_000
-"""All notebooks together [bytes]."""
+"""Largest size of all notebooks together [bytes]."""
 
 
 def test_notebooks_are_numbered_and_small() -> None:
@@ -38,7 +38,7 @@ def test_notebook_runs(path: Path, tmp_path: Path) -> None:
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
             stderr = output["text"] if output.get("name") == "stderr" else ""
-            # Where no kernel is compiled yet.
+            # On a machine without compiled kernels.
             assert all("once per machine" in line for line in stderr.split("\n") if line), stderr
 
 

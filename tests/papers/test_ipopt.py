@@ -1,4 +1,4 @@
-"""The whole arm-hand as one program, the reference that other methods are held against."""
+"""The whole arm-hand as one program: the reference for other methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import casadi_ik as ik
 
 
 def middle(robot, rng, part=0.6):
-    """A configuration well within the limits."""
+    """Return a configuration well within the limits."""
     centre, half_range = (robot.lower + robot.upper) / 2, (robot.upper - robot.lower) / 2
     return centre + part * half_range * rng.uniform(-1, 1, len(centre))
 
@@ -26,18 +26,18 @@ def solver(robot):
 
 @pytest.fixture(scope="module")
 def targets(robot):
-    """Contacts of hands drawn at random, 10 of them."""
+    """Ten contacts of random hands."""
     return robot.contacts(robot.random(np.random.default_rng(11), 10))
 
 
 def cost(batch: ik.BatchSolution) -> np.ndarray:
-    """Squared errors as the method weighs them: 100 mm like one unit of the normal."""
+    """Return squared errors with the weights of the method: 100 mm like one unit of the normal."""
     chords = 2 * np.sin(batch.angle_error / 2)
     return np.nansum((batch.position_error / 0.1) ** 2 + chords**2, axis=1)
 
 
 def test_start_near_the_solution_stays_near(robot, rng):
-    """A small barrier and a slight pull: no detour along the arm's self-motion."""
+    """A small barrier and a weak regularisation avoid detours along the self-motion of the arm."""
     q = np.array([middle(robot, rng) for _ in range(10)])
     starts = q + 1e-3 * rng.normal(size=q.shape)
     batch = ik.Solver(robot, "ipopt", TIGHT).solve_batch(*robot.contacts(q), q0=starts)
@@ -48,7 +48,7 @@ def test_start_near_the_solution_stays_near(robot, rng):
 
 
 def test_joint_limits_are_kept(tmp_path, rng):
-    """A four-bar that stops before its motor does: only a constraint can keep it there."""
+    """A four-bar that stops before its motor needs a constraint."""
     path = write_coupled_robot(tmp_path)
     replace(
         tmp_path / "parts" / "hand.yaml",
@@ -81,7 +81,7 @@ def test_non_finite_numbers_have_a_status(robot):
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_agrees_with_hand_first(name):
-    """Both solve to a micrometre, and their contacts are the same within twice that."""
+    """Both methods solve to a micrometre, so that their contacts agree within twice that."""
     robot = ik.load_robot(name)
     points, normals = robot.contacts(robot.random(np.random.default_rng(5), 12))
     batches = [
@@ -103,7 +103,7 @@ def test_shipped_grasps(name, solver):
 
 
 def test_impossible_contacts_are_met_as_well_as_by_hand_first(robot, targets):
-    """Half a metre out of reach, fingers torn apart, a normal turned round."""
+    """Contacts are half a metre out of reach, too far apart, or have a reversed normal."""
     points, normals = (array[:3].copy() for array in targets)
     points[0] += [0.0, 0.0, 1.5]
     points[1, 0] += [0.15, 0.0, 0.0]
@@ -117,7 +117,7 @@ def test_impossible_contacts_are_met_as_well_as_by_hand_first(robot, targets):
 
 
 def test_free_fingers_and_normals(robot, solver, targets):
-    """Free components are not constrained: the others are met although all could not be."""
+    """Free components are not constrained, even if all together could not be met."""
     points, normals = (array[:4].copy() for array in targets)
     points[0, 2] = normals[0, 2] = np.nan
     points[1, 1:] = normals[1, 1:] = np.nan
@@ -136,14 +136,14 @@ def test_free_fingers_and_normals(robot, solver, targets):
 
 
 def test_limits_are_never_exceeded(robot, tmp_path, targets):
-    """Neither by the answer nor by any iterate; ignored, they are no bounds."""
+    """Neither the answer nor any iterate violates limits; ignored limits are no bounds."""
     path = tmp_path / "log.mcap"
     batch = ik.Solver(robot, "ipopt").solve_batch(*targets, log=path)
     q = ik.logs.open(path).iterations().rows["q"]
     assert len(q) == batch.iterations.sum()
     assert np.all((q >= robot.lower) & (q <= robot.upper))
     assert np.all((batch.q >= robot.lower) & (batch.q <= robot.upper))
-    # A thumb that has to open further than it can.
+    # A thumb that would have to open beyond its limit.
     q = robot.home.copy()
     q[robot.actuators.index("bh_thumb_distal")] = -0.5
     contacts_beyond = [array[None] for array in robot.contacts(q)]

@@ -1,4 +1,4 @@
-"""The enhanced and original methods of Qiu & Kermani 2021, step by step and as a whole."""
+"""The enhanced and original methods of Qiu & Kermani 2021, by step and as a whole."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def ipopt(robot):
 
 
 def seen_from_palm(robot, q) -> tuple[np.ndarray, np.ndarray]:
-    """Points and normals of fingers 2 and 3 as the finger step takes them, (3, 2)."""
+    """Return points and normals of fingers 2 and 3 in the form of the finger step, (3, 2)."""
     points, normals = robot.contacts(q)
     palm = robot.palm(q)
     return (
@@ -41,7 +41,7 @@ def unit(x):
 
 
 def targets(robot, rng, count):
-    """Reachable ones, perturbed ones, and wild ones far beyond the limits, in turn."""
+    """Return reachable, perturbed, and far unreachable demands alternately."""
     for i, q in enumerate(robot.random(rng, count)):
         points, normals = seen_from_palm(robot, q)
         if i % 3 == 1:
@@ -58,11 +58,11 @@ def call(f, q, points, normals) -> np.ndarray:
 
 
 def test_generating_contacts_are_recovered(robot, closed, rng):
-    """For what a hand can do exactly, the step finds how, whatever the posture before."""
+    """The step finds the joints of a demand that a hand can meet exactly, from any posture."""
     hand = [SPREAD, *FLEXIONS["finger_2"], *FLEXIONS["finger_3"]]
     fixed_joints = [i for i in range(14) if i not in hand]
     sums = np.array(list(FLEXIONS.values()))
-    # Beyond a flexion sum of 140 deg the pad faces back, and its normal reads as another spread.
+    # Beyond a flexion sum of 140 deg the pad faces back, and the normal implies another spread.
     fair = [q for q in robot.random(rng, 60) if q[sums].sum(axis=1).max() < np.radians(139)]
     assert len(fair) > 30
     for q in fair:
@@ -73,7 +73,7 @@ def test_generating_contacts_are_recovered(robot, closed, rng):
 
 
 def test_closed_form_equals_ipopt(robot, closed, ipopt, rng):
-    """To 1e-9 on targets of all sorts: eq. (5) has one answer."""
+    """On all sorts of targets eq. (5) has one answer to 1e-9."""
     for q, points, normals in targets(robot, rng, 60):
         np.testing.assert_allclose(
             call(ipopt, q, points, normals), call(closed, q, points, normals), atol=1e-9
@@ -81,7 +81,7 @@ def test_closed_form_equals_ipopt(robot, closed, ipopt, rng):
 
 
 def test_far_side_of_the_circle_is_avoided_by_ipopt(own_robot, rng):
-    """With wide limits both minima lie inside; the nearer one has to win."""
+    """With wide limits both minima are inside, and the nearer one is returned."""
     hand = own_robot.with_name("hand.yaml")
     text = hand.read_text().replace("[0 deg, 140 deg]", "[-170 deg, 170 deg]")
     hand.write_text(text.replace("[0 deg, 48 deg]", "[-300 deg, 300 deg]"))
@@ -105,7 +105,7 @@ def miss(robot, name, q, points, normals) -> float:
 
 
 def test_closed_form_is_the_best_on_a_grid(robot, closed, rng):
-    """With spread and flexion sum held, no other flexion within limits comes closer."""
+    """With fixed spread and flexion sum, no other flexion within limits comes closer."""
     for q, points, normals in targets(robot, rng, 30):
         after = call(closed, q, points, normals)
         assert np.all(after[10:] >= robot.lower[10:] - 1e-12)
@@ -126,7 +126,7 @@ def test_closed_form_is_the_best_on_a_grid(robot, closed, rng):
 
 
 def test_normals_decide_spread_and_flexion_sum(robot, closed, rng):
-    """Eq. (4): whatever the points, attainable normals are met."""
+    """By eq. (4), attainable normals are met for any points."""
     for q in robot.random(rng, 20):
         q[[10, 12]] = rng.uniform(0.2, 1.5, 2)
         points, normals = seen_from_palm(robot, q)
@@ -135,7 +135,7 @@ def test_normals_decide_spread_and_flexion_sum(robot, closed, rng):
 
 
 def test_nearest_attainable_normal(robot, closed):
-    """A demand beyond the flexion limits is moved to the nearest end."""
+    """A demand beyond the flexion limits is moved to the nearest limit."""
     q = robot.home
     for excess in (-0.1, -0.3, -0.6):
         normals = np.empty((3, 2))
@@ -151,7 +151,7 @@ def test_nearest_attainable_normal(robot, closed):
 
 
 def test_fingers_on_one_spread_motor_agree(robot, closed):
-    """Mirrored demands of 20 and 50 deg with equal weight give 35 deg; a polar normal abstains."""
+    """Mirrored demands of 20 and 50 deg give 35 deg; a polar normal has no weight."""
     q = robot.home.copy()
 
     def demand(spread_2, spread_3, bend_2=0.7, bend_3=0.7):
@@ -179,7 +179,7 @@ def test_fingers_on_one_spread_motor_agree(robot, closed):
 
 
 def test_spread_keeps_motor_and_joints_within_limits(own_robot, rng):
-    """The joint's own limits bind where they are narrower than the motor's."""
+    """The limits of the joint apply where they are narrower than those of the motor."""
     hand = own_robot.with_name("hand.yaml")
     text = hand.read_text()
     at = text.index("name: bh_finger_3_spread")
@@ -212,11 +212,11 @@ PINCHES = np.array(
         [5, 65, 20], [0, 60, 18], [15, 70, 10], [0, 90, 8], [25, 75, 12], [10, 85, 15],
     ]
 )  # fmt: skip
-"""Spread, flexion of all proximal and of all distal joints [deg]: pinches, thumb against two."""
+"""Spread, proximal and distal flexion [deg] of pinches of the thumb against two fingers."""
 
 
 def pinch_targets(robot, count, seed=0):
-    """Contacts of every pinch on `count` arm configurations uniform within the limits."""
+    """Return contacts of every pinch on `count` arm configurations, uniform within the limits."""
     q = robot.random(np.random.default_rng(seed), len(PINCHES) * count)
     hands = np.radians(np.repeat(PINCHES, count, axis=0))
     q[:, 7] = hands[:, 0]
@@ -226,7 +226,7 @@ def pinch_targets(robot, count, seed=0):
 
 
 def run(robot, points, normals, limits="ignore", q0=None, step="closed-form", **options):
-    """Batch and traces of a run from home."""
+    """Return batch and traces of a run from home."""
     recorder, options = TraceRecorder(), {"max_iterations": 600, **options}
     solver = ik.Solver(robot, "enhanced-dls", limits=limits, finger_step=step, options=options)
     batch = solver.solve_batch(points, normals, q0=q0, log=recorder)
@@ -242,7 +242,7 @@ def pinches(robot):
 
 
 def of_phase(traces, phase):
-    """Rows (k,) of all solves in a phase, and the numbers (k,) of their solves."""
+    """Return the rows (k,) of all solves in a phase, and the numbers (k,) of their solves."""
     rows = [trace[trace["phase"] == phase] for trace in traces]
     numbers = np.repeat(np.arange(len(rows)), [len(trace_rows) for trace_rows in rows])
     assert len(numbers) > 100
@@ -290,7 +290,7 @@ def test_reaching_moves_arm_and_thumb_alone(robot, pinches):
 
 
 def test_reaching_ends_within_tolerance_without_another_step(robot):
-    """And with the arm in place the fingers' own step is all there is to do."""
+    """With the arm in place only the finger step remains."""
     goal = robot.home.copy()
     goal[7:] = np.radians([0, 75, 15, 75, 15, 75, 15])  # no spread: the palm estimate is the palm
     q0 = goal.copy()
@@ -305,7 +305,7 @@ def test_reaching_ends_within_tolerance_without_another_step(robot):
 
 
 def test_reaching_gives_up_after_a_while(robot):
-    """After 100 rows, or ten that are no better than the best before them."""
+    """A phase ends after 100 rows, or after ten without improvement."""
     points, normals = pinch_targets(robot, 1)
     _, traces = run(robot, points + 5.0, normals, max_iterations=150)
     counts = [np.sum(trace["phase"] == REACHING) for trace in traces]
@@ -315,7 +315,7 @@ def test_reaching_gives_up_after_a_while(robot):
 
 
 def test_alignment_records_the_configuration_after_the_fingers(robot, closed, pinches):
-    """The row holds the finger step's own result."""
+    """The row has the result of the finger step."""
     points, normals, _, traces = pinches
     rows, numbers = of_phase(traces, ALIGNMENT)
     assert np.isnan(rows["palm_error"]).all()
@@ -329,7 +329,7 @@ def test_alignment_records_the_configuration_after_the_fingers(robot, closed, pi
 
 
 def test_alignment_keeps_the_thumb(pinches):
-    """A thumb that is off its contact is brought back to it at once, but where a solve is lost."""
+    """A thumb off its contact is brought back at once, except in failed solves."""
     errors = [trace["position_error"][trace["phase"] == ALIGNMENT, 0] for trace in pinches[3]]
     improved = [
         row_errors[1] < 0.05 * row_errors[0] for row_errors in errors if len(row_errors) > 2
@@ -347,7 +347,7 @@ def test_step_cap(robot):
 
 
 def test_ipopt_iterates_as_the_closed_form(robot):
-    """The paper's own finger step, one solve: the same way to the same place."""
+    """The finger step of the paper takes the same path in one solve."""
     points, normals = (array[:1] for array in pinch_targets(robot, 1))
     (exact, (ours,)), (paper, (theirs,)) = (
         run(robot, points, normals, step=step) for step in ("closed-form", "ipopt")

@@ -1,4 +1,4 @@
-"""The tasks of Qiu & Kermani 2021: palm estimate, hierarchy, palm motion, the record of numbers."""
+"""The tasks of Qiu & Kermani 2021: palm estimate, hierarchy, palm motion, and recorded numbers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from casadi_ik.papers.qiu.tasks import (
 
 
 def estimate(robot: ik.ArmHand, points: np.ndarray) -> np.ndarray:
-    """Estimated palm orientation for (f, 3) contact points in the order of `robot.fingers`."""
+    """Return the estimated palm orientation for contacts (f, 3) in the robot's order."""
     symbols = ca.SX.sym("p", 3, len(points))
     goals = {name: Target(symbols[:, i], ca.SX.zeros(3, 1)) for i, name in enumerate(robot.fingers)}
     f = ca.Function("f", [symbols], [palm_orientation(robot.description, goals)])
@@ -85,7 +85,7 @@ COLUMNS = (0, 1, 2, 3, 4, 5, 6, 8, 9)
 
 @pytest.fixture(scope="module")
 def tasks(robot):
-    """(q, R desired, point, normal) -> Jacobian and error of palm (both ways), point, normal."""
+    """Function of q and a goal -> Jacobians and errors of palm (two kinds), point, normal."""
     q, R = ca.SX.sym("q", 14), ca.SX.sym("R", 3, 3)
     point, normal = ca.SX.sym("point", 3), ca.SX.sym("normal", 3)
     body = actuated(robot.description, q)
@@ -158,7 +158,7 @@ def step_function(count, damping, projection="successive"):
 
 
 def damped_steps(rng, damping):
-    """Three random tasks and numpy's damped solution of each."""
+    """Return three random tasks and the damped solution of each by numpy."""
     J, e = rng.normal(size=(3, 3, 9)), rng.normal(size=(3, 3))
     solved = [
         A.T @ np.linalg.solve(A @ A.T + damping**2 * np.eye(3), b)
@@ -168,7 +168,7 @@ def damped_steps(rng, damping):
 
 
 def test_hierarchy_is_the_successive_projection(rng):
-    """dq_1 + N_1 dq_2 + N_1 N_2 dq_3 with numpy's own pseudoinverse."""
+    """The hierarchy is dq_1 + N_1 dq_2 + N_1 N_2 dq_3 with numpy's pseudoinverse."""
     J, e, steps = damped_steps(rng, 0.1)
     N = [np.eye(9) - np.linalg.pinv(A) @ A for A in J]
     expected = steps[0] + N[0] @ steps[1] + N[0] @ N[1] @ steps[2]
@@ -177,20 +177,20 @@ def test_hierarchy_is_the_successive_projection(rng):
 
 
 def test_augmented_projection_keeps_every_higher_task(rng):
-    """dq_1 + N_1 dq_2 + N_12 dq_3 with numpy's own pseudoinverse of the stacked tasks."""
+    """The hierarchy is dq_1 + N_1 dq_2 + N_12 dq_3 with stacked pseudoinverses of numpy."""
     J, e, steps = damped_steps(rng, 0.1)
     stacked = [np.concatenate(J[: i + 1]) for i in range(2)]
     N = [np.eye(9) - np.linalg.pinv(A) @ A for A in stacked]
     expected = steps[0] + N[0] @ steps[1] + N[1] @ steps[2]
     f = step_function(3, 0.1, "augmented")
     step = np.array(f.call([*map(ca.DM, J), *map(ca.DM, e)])[0]).ravel()
-    # RANK_FLOOR damps the projector a little.
+    # RANK_FLOOR damps the projector slightly.
     np.testing.assert_allclose(step, expected, atol=1e-5)
 
 
 @pytest.fixture(scope="module")
 def motion(robot):
-    """(q, points (k, 3), normals (k, 3)) -> translation [mm], rotation [rad], palm frame."""
+    """Function of q and contacts (k, 3) -> translation [mm], rotation [rad], palm frame."""
     q = ca.SX.sym("q", 14)
     points, normals = ca.SX.sym("p", 3, 2), ca.SX.sym("n", 3, 2)
     goals = {f: Target(points[:, i], normals[:, i]) for i, f in enumerate(robot.fingers[1:])}
@@ -219,7 +219,7 @@ def test_translations_are_found_exactly(robot, motion, rng):
 
 
 def twist_of(pose):
-    """Linear and angular part of a logarithm, by scipy."""
+    """Return the linear and angular parts of a logarithm by scipy."""
     twist = np.real(logm(pose))
     return twist[:3, -1], np.array([twist[2, 1], twist[0, 2], twist[1, 0]])
 
@@ -248,7 +248,7 @@ def test_eqs_9_to_14_literally(robot, motion, rng):
 
 
 def test_three_fingers(robot, rng):
-    """More than two demands go through the polar projection."""
+    """More than two demands use the polar projection."""
     q = ca.SX.sym("q", 14)
     points, normals = ca.SX.sym("p", 3, 3), ca.SX.sym("n", 3, 3)
     goals = {f: Target(points[:, i], normals[:, i]) for i, f in enumerate(robot.fingers)}

@@ -1,4 +1,4 @@
-"""The screw control law: its rate, its limits, what it leaves free, and its log."""
+"""The screw control law: rate, limits, uncontrolled motion, and log."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ KINDS = ("pose", "position", "planar-pose", "distance", "contact")
 
 @pytest.fixture(scope="module")
 def toy(coupled_robot) -> ik.ArmHand:
-    """Sliders, a four-bar, linear couplings, a shared motor, a prismatic joint."""
+    """Robot with sliders, a four-bar, linear couplings, a shared motor, and a prismatic joint."""
     return coupled_robot
 
 
@@ -33,7 +33,7 @@ def posture(toy, rng, part=0.4):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("relative_to", [None, "thumb"])
 def test_error_falls_by_the_gain_per_step(kind, relative_to, toy, rng):
-    """A reachable target: the rate is -ln(1 - gain period) / period, and nothing is left."""
+    """For a reachable target the rate is -ln(1 - gain period) / period, and no error remains."""
     if kind == "distance" and relative_to is None:
         return
     control = law(toy, kind, relative_to, gain=1.0, period=0.4)
@@ -42,7 +42,8 @@ def test_error_falls_by_the_gain_per_step(kind, relative_to, toy, rng):
     assert run.error_norm[0] > 1e-3
     assert run.error_norm[-1] < 1e-9
     last = run.error_norm[np.flatnonzero(run.error_norm > 1e-8)][-10:]
-    # The planar pose's turn is exact where the finger moves in the plane; this one does not.
+    # The rotation of the planar pose is exact for a finger that moves in the plane, unlike this
+    # one.
     exact = 1e-3 if kind != "planar-pose" else 0.05
     assert last[1:] / last[:-1] == pytest.approx(0.6, rel=exact)
     assert run.rate() == pytest.approx(-np.log(0.6) / 0.4, rel=0.05)
@@ -71,7 +72,7 @@ def test_the_compiled_loop_makes_the_same_steps(toy, rng):
 
 
 def test_two_sliders_cannot_take_six_rows_to_zero(toy):
-    """Only part of an unreachable pose is fulfilled: the law rests at the least squares."""
+    """For an unreachable pose the law rests at the least-squares error."""
     control = law(toy, "pose", None)
     target = control.target(middle(toy))
     pose = np.eye(4)
@@ -100,7 +101,7 @@ def test_null_space_returns_to_mid_range_without_disturbing_the_task(toy, rng):
 
 
 def test_slider_at_its_limit_leaves_the_motion_to_the_others(toy):
-    """From a corner, towards a target that three motors reach without the one in the corner."""
+    """The start is a corner of the limits, and the target needs only three other motors."""
     corner = middle(toy)
     corner[1] = toy.upper[1]
     goal = corner.copy()
@@ -177,7 +178,7 @@ def test_bad_input_is_refused(make, error, words, toy):
 
 
 def test_arm_extends_the_reach_of_a_finger(rng):
-    """On Baxter the index tip goes 10 cm away; arm and sliders share the work, within limits."""
+    """On Baxter the index tip moves by 10 cm, shared by arm and sliders, within limits."""
     baxter = ik.load_robot("baxter_ar10")
     control = ik.papers.ScrewControl(
         baxter, ik.papers.ScrewTask("position", "index"), 0.3, compiled=False

@@ -1,4 +1,4 @@
-"""Every condition of a contact: residual, Jacobian, errors, against formulas of its own."""
+"""Every contact condition: residual, Jacobian and errors, by independent formulas."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from casadi_ik.solve.thumb_first.closed_chain_step import contact_errors, linear
 
 ARM = 7
 RADIUS = 9.5e-3
-"""Of Barrett's pads [m]."""
+"""Radius of the pads of the Barrett hand [m]."""
 
 BY_ASPECT = [
     [name for name, condition in CONDITIONS.items() if condition.aspect == aspect]
@@ -58,7 +58,7 @@ def number(value):
 
 
 def differences(function, x, step=1e-6):
-    """Central differences (m, n)."""
+    """Return central differences (m, n)."""
     ahead, behind = ([function(x + sign * step * e) for e in np.eye(len(x))] for sign in (1, -1))
     return np.column_stack([(a - b) / (2 * step) for a, b in zip(ahead, behind, strict=True)])
 
@@ -69,7 +69,7 @@ def units(rng, count):
 
 
 def data_at(robot, q, rng):
-    """Every vector a target can have, so that the contacts are met at q."""
+    """Return every vector of a target, such that the contacts are met at q."""
     frames = robot.contact_frames(q)
     f = len(frames)
     return {
@@ -106,7 +106,7 @@ def test_full_jacobian_matches_differences(robot, kind, rng):
 
 @every_kind
 def test_hand_jacobian_matches_differences(robot, kind, rng):
-    """Over a palm that shifts and turns, too: there it is the targets that move."""
+    """Over a palm that moves and turns, the targets move instead."""
     q, q_target = robot.random(rng, 2)
     p, rows = parameters(data_at(robot, q_target, rng)), ContactRows((kind,) * 3)
     palm = robot.palm(q)
@@ -157,7 +157,7 @@ def test_newton_rows_match_differences_at_the_target(robot, kind, rng):
 
 
 def own_errors(kind, data, frames):
-    """Distances and angles by NumPy and SciPy."""
+    """Return distances and angles by NumPy and SciPy."""
     off = frames[:, :3, 3] - data["points"]
     distance = {
         "point": np.linalg.norm(off, axis=1),
@@ -202,7 +202,7 @@ angles = st.floats(-3.1, 3.1)
 
 @given(turn=st.tuples(angles, angles, angles), rotation_axis=st.sampled_from([0, 1, 2]))
 def test_frame_error_is_isotropic(turn, rotation_axis):
-    """The length of its residual is the chord of the angle, about whatever axis it is turned."""
+    """The length of the residual is the chord of the angle, for any axis of rotation."""
     start = Rotation.from_euler("xyz", turn)
     axis, angle = np.eye(3)[rotation_axis], abs(turn[0])
     end = Rotation.from_rotvec(axis * angle) * start
@@ -348,7 +348,7 @@ def test_best_palm_recovers_the_palm(robot, layouts, rng):
 
 @pytest.mark.parametrize(("shift", "sign"), [(0.0, 0), (1.0, 1), (-2.0, -1)])
 def test_reach_row_matches_differences(robot, shift, sign):
-    """Zero within reach, the distance beyond it, and its slope."""
+    """The residual is zero within reach, and the distance beyond it, with its slope."""
     arm, p = srs_arm(robot.description), fit_parameters(robot, np.ones((3, 3)), np.ones((3, 3)))
     rotation = robot.palm(robot.home)[:3, :3]
     wrist = np.array([0.3, 0.3, 0.6]) * (1 + shift) if sign >= 0 else np.array([0.1, 0, 0.2])
@@ -378,7 +378,7 @@ def test_numeric_arm_starts_are_sorted_by_distance(robot):
         arms.append(np.array(arm).ravel())
     assert np.all(np.diff(distances) > 0)
     assert len(np.unique(np.round(arms, 9), axis=0)) == NUMERIC_ARM_PARAMETERS.table_size
-    # After the last one they begin anew.
+    # After the last one the starts repeat.
     assert float(start(palm[:3, :3], palm[:3, 3], previous)[1]) == distances[0]
     q = np.tile(robot.home, (1, 1))
     q[0, :ARM] = arms[0]

@@ -1,4 +1,4 @@
-"""Targets as arrays: what they mean, and what is refused."""
+"""Targets as arrays: meaning and refusals."""
 
 from __future__ import annotations
 

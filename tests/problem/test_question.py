@@ -1,4 +1,4 @@
-"""What a question may say beside the contacts: tolerances of their own, actuators held fixed."""
+"""Tolerances by contact and fixed actuators in targets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ COARSE = ik.Tolerance(0.08, 0.5)
 
 
 def grasp(robot, q, tolerances=None, shift=0.0) -> ik.Grasp:
-    """The contacts of a configuration, the thumb's moved along its normal."""
+    """Return the contacts of a configuration, the thumb's moved along its normal."""
     points, normals = robot.contacts(q)
     points = points.copy()
     points[robot.fingers.index(robot.thumb)] += shift * normals[robot.fingers.index(robot.thumb)]
@@ -26,7 +26,7 @@ def grasp(robot, q, tolerances=None, shift=0.0) -> ik.Grasp:
 
 @pytest.mark.parametrize("method", ["hand-first", "ipopt", "enhanced-dls"])
 def test_each_contact_has_its_tolerance(robot, method):
-    """Fingers that must be exact are, at the cost of the thumb that need not be."""
+    """Fingers with tight tolerances are exact, at the expense of a thumb with a coarse one."""
     options = {"finger_step": "closed-form"} if method.startswith("enhanced") else {}
     solver = ik.Solver(robot, method, tolerance=ik.Tolerance(1e-3, 1e-2), **options)
     grasp_with_coarse = grasp(robot, robot.home + 0.02, {robot.thumb: COARSE})
@@ -40,7 +40,7 @@ def test_each_contact_has_its_tolerance(robot, method):
 
 
 def test_coarse_contact_makes_a_grasp_possible(robot):
-    """Moved by 70 mm the thumb cannot be met exactly; with a tolerance of its own it need not."""
+    """Moved by 70 mm the thumb cannot be met exactly, but within a coarse tolerance."""
     q = robot.home + 0.01
     assert not ik.Solver(robot).solve(grasp(robot, q, shift=0.07), diagnose=False).success
     coarse = {robot.thumb: COARSE}
@@ -81,7 +81,7 @@ def test_grasp_file_with_tolerances(tmp_path):
 
 @pytest.mark.parametrize("method", ["hand-first", "ipopt"])
 def test_fixed_actuators_stay(robot, method):
-    """The elbow's swivel is the arm's one freedom: joint 3 can be given, within reason."""
+    """The swivel of the elbow is the only redundancy of the arm, so that joint 3 can be fixed."""
     solver = ik.Solver(robot, method)
     points, normals = robot.contacts(robot.random(np.random.default_rng(3), 20))
     free = solver.solve_batch(points, normals)
@@ -96,7 +96,7 @@ def test_fixed_actuators_stay(robot, method):
 
 
 def test_unsuitable_spread_is_detected(robot):
-    """With the hand's spread held elsewhere the contacts cannot be met, and the verdict says so."""
+    """With an unsuitable fixed spread the contacts cannot be met, and the verdict reports it."""
     solution = ik.Solver(robot).solve(grasp(robot, robot.home), fixed={"bh_spread": 2.5})
     assert not solution.success
     assert solution.status in (ik.Status.UNREACHABLE, ik.Status.NOT_FOUND)

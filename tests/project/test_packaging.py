@@ -1,4 +1,4 @@
-"""What is installed, and what it imports."""
+"""Installed files, extras and imports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import casadi_ik as ik
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 ON_DEMAND = "pinocchio coal matplotlib pyvista polars mujoco scipy proxsuite trimesh collada rich"
-"""What the public names do not import."""
+"""Packages that the public names do not import."""
 
 
 def test_version_is_stated_once():
@@ -110,7 +110,7 @@ POSIX_CALLS = {"chown", "fork", "geteuid", "getuid", "killpg", "mkfifo", "SIGKIL
 
 @pytest.mark.parametrize("folder", ["casadi_ik", "tests", "studies", "tools"])
 def test_modules_can_be_imported_on_windows(folder):
-    """Code outside functions imports and calls only what every platform has."""
+    """Code outside functions imports and calls only names of all platforms."""
     for path in (ROOT / folder).rglob("*.py"):
         pending = list(ast.parse(path.read_text(encoding="utf-8")).body)
         for node in pending:

@@ -1,4 +1,4 @@
-"""Public names of the package, and old import paths of documented modules."""
+"""Public names of the package, and deprecated import paths of documented modules."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_every_public_name_is_found():
 
 
 FRAMEWORKS = {"adapters.isaac_teleop", "adapters.lerobot"}
-"""Adapters whose frameworks the tests do not install."""
+"""Adapters whose frameworks are not installed for tests."""
 
 
 @pytest.mark.slow

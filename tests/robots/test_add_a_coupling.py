@@ -1,4 +1,4 @@
-"""A fourth kind of coupling, the lines of docs/add_a_coupling.md, in a copy of the package."""
+"""The lines of docs/add_a_coupling.md add a kind of coupling to a copy of the package."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_kind_is_added_in_two_files(tmp_path):
 
 
 class Wire(CouplingKind, frozen=True, tag="wire"):
-    """A kind that says nothing of itself."""
+    """Kind of coupling without any functions."""
 
 
 def test_an_unknown_kind_is_an_error(coupled_robot):

@@ -1,4 +1,4 @@
-"""The AR10: sliders to joints by triangles and four-bars, over the whole stroke."""
+"""The AR10: from sliders to joints by triangles and four-bars, over the whole stroke."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SLIDERS = (
 
 
 def strokes(robot: ik.ArmHand, rows: int = 200) -> np.ndarray:
-    """All sliders from shortest to longest."""
+    """Return configurations with all sliders from shortest to longest."""
     return robot.lower + np.linspace(0, 1, rows)[:, None] * (robot.upper - robot.lower)
 
 
@@ -33,7 +33,7 @@ def test_ten_sliders_and_five_fingers(ar10):
 
 
 def test_published_reference_pose(ar10):
-    """Chandra's code gives axes and tips with the sliders shortest; here that is at 4 mrad."""
+    """Chandra's code gives axes and tips at the shortest sliders, here within 4 mrad."""
     points, _ = ar10.contacts(ar10.lower)
     np.testing.assert_allclose(points[0], [-0.0927, 0.0702, 0.1023], atol=5e-5)
     np.testing.assert_allclose(points[1], [-0.0465, 0.04929, 0.22703], atol=4e-4)
@@ -42,14 +42,14 @@ def test_published_reference_pose(ar10):
     w, x, y, z = 0.905343, 0.204069, 0.187212, 0.321964
     axis_x = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
     np.testing.assert_allclose(pose[:3, 0], axis_x, atol=1e-5)
-    # The published dual part: twice its product with the conjugate is the tip.
+    # Twice the product of the published dual part with the conjugate is the tip.
     dual = np.array([-0.0135809, -0.0402491, 0.0571297, 0.0304804])
     tip = 2 * (w * dual[1:] - dual[0] * np.array([x, y, z]) + np.cross([x, y, z], dual[1:]))
     np.testing.assert_allclose(pose[:3, 3], tip, atol=1e-6)
 
 
 def test_pads_face_the_flexion_direction(ar10):
-    """A pad's normal is the direction in which flexing its last joint moves the tip."""
+    """The normal of a pad is the direction in which flexing its last joint moves the tip."""
     for finger in ar10.description.fingers:
         rows = list(ar10.description.finger_actuators(finger.name))
         q = ar10.home.copy()
@@ -83,7 +83,7 @@ def test_the_strokes_imply_the_joint_limits(ar10):
 
 
 def test_toggle_margins(ar10):
-    """The squared sine of the transmission angle, from angles alone; far from zero everywhere."""
+    """The squared sine of the transmission angle is far from zero everywhere."""
     q = strokes(ar10)
     joints, margins = ar10.joints(q), ar10.toggle_margins(q)
     assert set(margins) == set(joints)
@@ -102,7 +102,7 @@ def test_toggle_margins(ar10):
 
 
 def test_nothing_is_nan_beyond_the_toggles(ar10):
-    """Sliders far beyond their strokes: flat triangles, four-bars that cannot be assembled."""
+    """Beyond their strokes, sliders give flat triangles and open four-bars."""
     q = np.repeat([[0.0], [0.01], [0.0358], [0.0392], [0.0638], [0.0652], [0.1]], 10, axis=1)
     assert np.isfinite(list(ar10.joints(q).values())).all()
     assert np.isfinite(ar10.contacts(q)).all()

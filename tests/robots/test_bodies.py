@@ -1,4 +1,4 @@
-"""Bodies: what their files say, and that a side by itself is the body's."""
+"""Multi-arm robots: their files, and sides as robots of their own."""
 
 from pathlib import Path
 
@@ -43,7 +43,7 @@ def test_side_alone_matches_the_body(name):
 
 @pytest.mark.parametrize("name", ["g1+dex3", "g1+inspire", "h1_2+inspire"])
 def test_mirrored_sides_reflect(name):
-    """The same grasp by the other side is the mirror image of this one's."""
+    """A grasp by one side is the mirror image of the grasp by the other side."""
     robot = ik.load_robot(name)
     body, q = robot.description, robot.home.copy()
     left, right = (

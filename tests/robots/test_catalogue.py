@@ -25,7 +25,7 @@ from casadi_ik import model as robots
 ARMS, HANDS = ik.shipped_names("arms"), ik.shipped_names("hands")
 FEWER = {"panda_hand": 2, "robotiq_2f85": 2, "widowx_gripper": 2, "so100_jaw": 2, "tool": 1}
 UNMOVED = {"tool": ("tip",), "so100_jaw": ("fixed",)}
-"""By hand the fingers that no joint moves against the palm."""
+"""Fingers of each hand that no joint moves relative to the palm."""
 
 PUBLISHED = json.loads(Path(__file__).with_name("published_poses.json").read_text())
 
@@ -110,7 +110,7 @@ def test_missing_file_is_named(path):
 
 
 def test_a_grasp_file_may_name_a_pair(tmp_path, capsys):
-    """The command line counts a path from the file, but a pair is no path."""
+    """The command line resolves paths relative to the file, but a pair is not a path."""
     contact = {"point": [0.4, 0.1, 0.5], "normal": [0, 0, 1]}
     path = tmp_path / "grasp.yaml"
     path.write_text(yaml.safe_dump({"robot": "panda+leap", "contacts": {"thumb": contact}}))
@@ -118,7 +118,7 @@ def test_a_grasp_file_may_name_a_pair(tmp_path, capsys):
     assert "--q0: found 1 numbers, expected 23: panda_joint_1, " in capsys.readouterr().err
 
 
-# Arms and hands by themselves.
+# Arms and hands alone.
 
 
 @pytest.mark.parametrize("name", ["allegro_right", "panda_hand"])
@@ -166,13 +166,13 @@ def test_robot_file_suggests_import(name: str) -> None:
         ik.load_robot(name)
 
 
-# Grippers: pads that face each other, and a jaw that no joint moves.
+# Grippers: opposed pads, and a jaw that is fixed to the palm.
 
 OPENED = {
     "widowx_gripper": ((0.015, 0.012), (0.037, 0.056)),
     "so100_jaw": ((0.0, 0.0158),),
 }
-"""By gripper the motor's position and how far apart [m] its parallel pads then are."""
+"""Motor position and distance [m] between the parallel pads of each gripper."""
 
 
 @pytest.mark.parametrize("gripper", OPENED)
@@ -193,7 +193,7 @@ def test_random_contacts_are_solved(pair: str, rng: np.random.Generator) -> None
 
 
 def test_held_object_may_touch_the_fixed_jaw_only() -> None:
-    """A ball between the tips is free; as far in as the motor it is not."""
+    """A ball between the tips is free; a ball at the motor collides."""
     robot = ik.load_robot("ur5e+so100_jaw")
     q = robot.home.copy()
     q[robot.actuators.index("so100_jaw")] = 0.2

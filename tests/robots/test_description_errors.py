@@ -1,4 +1,4 @@
-"""Every way to break a description gives one line that names file and key."""
+"""Every error in a description gives one line with file and key."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ coupled | p: 2.97 cm => p: 5 cm
 coupled | b: 52.2 mm => b: 35 mm
     joint 'left_1': coupling | to 0.06 m, expected within |b - c| = 0.022 and b + c = 0.048
 """
-"""Two lines each: the file and what is changed in it, then the key and what is said of it."""
+"""Two lines per case: the file and the change in it, then the key and the message."""
 
 LINES = CASES.strip().splitlines()
 LONG = "x" * 101

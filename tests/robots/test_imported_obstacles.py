@@ -1,4 +1,4 @@
-"""What cannot be imported is refused in one line that names file and joint, and what to write."""
+"""Robots that cannot be imported are refused in one line with file, joint and remedy."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ joint="left_bend" => joint="left_end"
 <link name="left_2"/> => <link/>
     a link: name: missing
 """  # noqa: E501
-"""Two lines each: what is changed in the hand's file, and what is said of it."""
+"""Two lines per case: the change in the hand's file, and the message."""
 
 
 def pairs(text: str) -> list[tuple[str, str]]:

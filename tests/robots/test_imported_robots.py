@@ -1,4 +1,4 @@
-"""Robots in files of others: URDF and MJCF, alone and as parts."""
+"""Robots in URDF and MJCF files, whole and as parts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"
 
 
 def both(tmp_path, arm_text="", hand_text="", hand_mount=MOUNT, hand_changes=(), joints=6):
-    """An arm and a hand in files of their own; the robot, and its files' differences from it."""
+    """Return the robot of an arm and a hand in files of their own."""
     arm(tmp_path, joints)
     hand(tmp_path, *hand_changes)
     path = describe(
@@ -49,7 +49,7 @@ def test_arm_and_hand_match_pinocchio(tmp_path, rng):
     assert robot.actuators == (*names, "left_spread", "left_bend", "right_spread", "right_bend")
     q = robot.random(rng, 1)[0]
     poses = robot.links(q)
-    # Both files call their first link base_link: the hand's gets a prefix.
+    # Both files name their first link base_link, so that the hand's gets a prefix.
     mount = np.linalg.inv(poses["flange"]) @ poses["hand_base_link"]
     np.testing.assert_allclose(mount[:3, 3], [0.01, 0.02, 0.03], atol=1e-15)
     tip = poses["left_tip"] @ [0, -0.01, 0.03, 1]
@@ -62,12 +62,12 @@ def test_arm_and_hand_match_pinocchio(tmp_path, rng):
 def test_clashing_joints_of_the_hand_get_a_prefix(tmp_path, rng):
     robot = both(tmp_path, hand_changes=[("left_bend", "joint_1")])
     assert "hand_joint_1" in robot.actuators
-    # Its follower found it again, and pinocchio agrees.
+    # Its follower uses the new name, and pinocchio agrees.
     check(robot, tmp_path / "hand.urdf", rng, beside=tmp_path / "arm.urdf")
 
 
 def test_links_beyond_the_tip_may_share_names(tmp_path, rng):
-    """An arm's file that ends in a `right_hand`, with which the hand's begins."""
+    """The file of an arm ends in a link whose name the hand's file also has."""
     path, box = arm(tmp_path, 6), '<geometry><box size="0.3 0.2 0.1"/></geometry>'
     extra_link = f'<link name="left_tip"><collision>{box}</collision></link>'
     extra_link += joint("wrist_plate", "flange", "left_tip", "fixed", xyz="0.3 0 0", rpy="0 1 0")
@@ -139,7 +139,7 @@ def test_one_file_with_its_palm(tmp_path, rng):
     assert robot.actuators == ("slide", "roll", "left_spread", "right_bend")
     assert robot.description.arm_actuators == (0, 1)
     assert robot.description.actuators[0].unit == "m"
-    # Without ends a joint may turn once to either side; an end left out is zero; 0 is no velocity.
+    # A joint without limits has one turn to each side; a missing limit is 0; velocity 0 is none.
     np.testing.assert_allclose(robot.upper[1], 2 * np.pi)
     assert robot.description.actuators[3].lower == 0.0
     assert robot.description.actuators[3].velocity == np.inf
@@ -420,7 +420,7 @@ XACRO = """<robot name="$(arg name)" xmlns:xacro="http://www.ros.org/wiki/xacro"
 
 
 def write_xacro(folder, text=XACRO):
-    """A description of a maker in a folder that has another name than its package."""
+    """Write a description of a maker into a folder with another name than its package."""
     pytest.importorskip("xacro")
     for name in ("clone/robots", "clone/parts"):
         (folder / name).mkdir(parents=True)

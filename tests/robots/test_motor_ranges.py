@@ -1,4 +1,4 @@
-"""Limits of coupled joints are limits of their motors: for bounds, random draws and methods."""
+"""Limits of coupled joints limit their motors: in bounds, random configurations and methods."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NARROW = {
     "right_spread": [-0.3, 0.4],
     "thumb_bend": [0.4, 1.2],
 }
-"""Limits of joints that their motors could pass."""
+"""Limits of joints that their motors could exceed."""
 
 
 def narrow_robot(folder):
@@ -39,7 +39,7 @@ def narrow(tmp_path):
 
 
 def narrow_barrett(folder):
-    """The shipped arm with the coupled hand, whose distal joints keep to 8 to 30 deg."""
+    """Shipped arm with the coupled hand, whose distal joints are limited to 8 to 30 deg."""
     path = copy_shipped_robot(folder)
     models = MODELS
     hand = yaml.safe_load((models / "hands" / "barrett_bh8_280_coupled.yaml").read_text())
@@ -60,7 +60,7 @@ def test_random_configurations_keep_joint_limits(narrow, rng):
 
 
 def test_the_range_is_as_wide_as_the_joints_allow(narrow):
-    """At either end of every motor that was narrowed, some joint stands at its own limit."""
+    """At either end of every narrowed motor range, some joint is at its own limit."""
     strokes = narrow.description.actuator_limits
     narrowed = set()
     for side, ends in enumerate((narrow.lower, narrow.upper)):
@@ -95,7 +95,7 @@ def test_numbers_match_the_graphs(rng):
 
 
 def test_non_monotonic_coupling_keeps_the_interval_of_home(tmp_path):
-    """A four-bar's output turns where rod and ground align: the interval of home is kept."""
+    """A four-bar turns back where rod and ground align; home's interval is kept."""
     path = narrow_robot(tmp_path)
     hand = yaml.safe_load((tmp_path / "parts" / "hand.yaml").read_text())
     joints = {joint["name"]: joint for joint in hand["joints"]}
@@ -111,7 +111,7 @@ def test_non_monotonic_coupling_keeps_the_interval_of_home(tmp_path):
     theta = wide.joints(q)["left_3"]
     lowest = int(theta.argmin())
     assert 100 < lowest < 3900
-    # Both sides of the turning point reach the same height; only one of them holds home.
+    # Both sides of the turning point reach the same angle, but only one contains home.
     joints["left_3"]["limits"] = [float(theta[lowest]) + 0.02, 6]
     (tmp_path / "parts" / "hand.yaml").write_text(yaml.safe_dump(hand))
     for home in (q[50, place], q[3950, place]):
@@ -159,7 +159,7 @@ def test_solutions_keep_follower_limits(tmp_path, rng, method, tolerance):
         q = np.where(rng.random(q.shape) < 0.2, end, q)
     points, normals = robot.contacts(q)
     batch = ik.Solver(robot, method, tolerance).solve_batch(points, normals)
-    # Thumb-first misses one in a thousand of any robot's targets, wherever its limits are.
+    # Thumb-first misses one in a thousand targets of any robot.
     assert (~batch.success).sum() <= (method == "thumb-first")
     assert robot.beyond_limits(batch.q).max() <= 1e-9
 

@@ -1,4 +1,4 @@
-"""A user's own descriptions: relative paths, couplings as data, a hand without an arm."""
+"""Descriptions of users: relative paths, couplings as data, a hand without an arm."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_couplings_follow_their_closed_formulas(coupled_robot, rng):
         return np.arccos((b * b + c * c - s * s) / (2 * b * c))
 
     left_2 = triangle(s_2, 0.0498, 0.014) - 0.81437063
-    # Chandra, eq. (9), the branch as printed, lengths in cm.
+    # Chandra, eq. (9), with the printed branch, lengths in cm.
     p, bar_q, g, h = 2.97, 3.47, 0.84, 0.72
     phi = 3.32939008 + left_2
     a, b = 2 * p * bar_q * np.cos(phi) - 2 * g * bar_q, 2 * p * bar_q * np.sin(phi)
@@ -141,7 +141,7 @@ def test_names_are_arbitrary(tmp_path, rng):
 
 
 def test_the_documented_robot_is_solved(tmp_path):
-    """The robot of docs/add_a_robot.md is what the page says."""
+    """The robot of docs/add_a_robot.md is as the page states."""
     page = (ROOT / "docs" / "add_a_robot.md").read_text(encoding="utf-8")
     (text,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     path = tmp_path / "pincher.yaml"
@@ -155,11 +155,11 @@ def test_the_documented_robot_is_solved(tmp_path):
     assert ik.Solver(documented).solve_batch(*documented.contacts(q)).success.all()
 
 
-# A hand that stands in the robot's file in full, instead of by name.
+# A hand that is written in full in the robot's file.
 
 
 def in_full(folder: Path, name: str = "kuka_lwr_barrett", **changes: Any) -> Path:
-    """A shipped robot with its hand written out; keyword arguments replace the hand's keys."""
+    """Write a shipped robot with its hand in full; keyword arguments replace keys of the hand."""
     robot = yaml.safe_load((MODELS / "arm_hands" / f"{name}.yaml").read_text())
     hand = yaml.safe_load((MODELS / "hands" / f"{robot['hand']}.yaml").read_text())
     path = folder / "whole.yaml"

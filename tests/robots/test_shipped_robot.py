@@ -1,4 +1,4 @@
-"""The shipped robots against the published tables, computed here a second time."""
+"""The shipped robots compared with an independent computation of the published tables."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ BAXTER = [
 
 
 def chain(thetas: np.ndarray, table: list[tuple[float, ...]]) -> np.ndarray:
-    """Pose of the last frame by standard DH: Rz(theta) Tz(d) Tx(a) Rx(alpha)."""
+    """Return the pose of the last frame by standard DH: Rz(theta) Tz(d) Tx(a) Rx(alpha)."""
     pose = np.eye(4)
     for theta, (offset, d, a, alpha) in zip(thetas, table, strict=True):
         pose = pose @ rot(2, theta + offset * DEG) @ shift(2, d) @ shift(0, a) @ rot(0, alpha * DEG)
@@ -49,7 +49,7 @@ def chain(thetas: np.ndarray, table: list[tuple[float, ...]]) -> np.ndarray:
 
 
 def lwr(theta: np.ndarray) -> np.ndarray:
-    """Flange pose."""
+    """Return the pose of the flange."""
     return chain(theta, LWR)
 
 
@@ -58,7 +58,7 @@ NUMBER = {"thumb": 3, "finger_2": 2, "finger_3": 1}
 
 
 def barrett(k: int, spread: float, proximal: float, distal: float) -> tuple[np.ndarray, np.ndarray]:
-    """Frames {3} and {T} of finger k in frame W by modified DH (manual, Table 9)."""
+    """Return frames {3} and {T} of finger k in frame W by modified DH (manual, Table 9)."""
     r, j = R_SIGN[k], J_SIGN[k]
     phi_2, phi_3 = 2.456 * DEG, 37.544 * DEG
     rows = [
@@ -91,7 +91,7 @@ def test_contacts_by_denavit_hartenberg(robot, rng):
 
 
 def test_palm_frame_is_on_the_flange(robot, rng):
-    """Frame W is the flange's; the palm frame is parallel to it, on the palm's surface."""
+    """Frame W is that of the flange; the palm frame is parallel to it, on the palm."""
     for q in robot.random(rng, 10):
         flange, surface = lwr(q[:7]), np.eye(4)
         surface[2, 3] = 0.080
@@ -102,7 +102,7 @@ def test_palm_frame_is_on_the_flange(robot, rng):
 
 
 def test_published_tips_of_the_open_hand(robot):
-    """Tips and normals at spread 0, proximal 0."""
+    """Tips and normals at spread 0 and proximal 0 are as published."""
     palm = robot.links(np.zeros(14))["bh_base"]
     points, normals = robot.contacts(np.zeros(14))
     local = (points - palm[:3, 3]) @ palm[:3, :3]
@@ -246,7 +246,7 @@ def test_unknown_names_list_the_known(robot):
 
 
 def test_derived_data_are_not_pickled() -> None:
-    """Else every solver would have kernels of its own."""
+    """Derived data in pickles would give every solver kernels of its own."""
     description = ik.load_robot("kuka_lwr_barrett").description
     data_before = pickle.dumps(description)
     assert description.movable
@@ -255,7 +255,7 @@ def test_derived_data_are_not_pickled() -> None:
     assert pickle.loads(data_before).actuator_names == description.actuator_names
 
 
-# Baxter's right arm with the AR10.
+# Right arm of Baxter with the AR10.
 
 
 @pytest.fixture(scope="module")
@@ -290,7 +290,7 @@ def test_hand_equals_the_ar10(baxter, rng):
     np.testing.assert_allclose(baxter.palm(q), hand @ hand_alone.palm(hand_alone.home), atol=1e-14)
 
 
-# The Barrett hand as it is driven: four motors, distal joints a third of the proximal ones.
+# The Barrett hand with its four motors: distal joints follow at a third of the proximal ones.
 
 BARRETT_FINGERS = ("thumb", "finger_2", "finger_3")
 
@@ -301,7 +301,7 @@ def coupled() -> ik.ArmHand:
 
 
 def independent(coupled: ik.ArmHand, robot: ik.ArmHand, q: np.ndarray) -> np.ndarray:
-    """The same posture in the coordinates of the hand with independent distal joints."""
+    """Return the posture in the coordinates of the hand with independent distal joints."""
     joints = coupled.joints(q)
     positions = dict(zip(coupled.actuators, q.T, strict=True)) | joints
     return np.stack([positions[name] for name in robot.actuators], axis=1)
@@ -339,7 +339,7 @@ def test_coupled_hand_matches_the_uncoupled(coupled, robot, rng):
 
 @pytest.mark.parametrize("method", ["enhanced-dls", "enhanced-sdls"])
 def test_paper_methods_explain_refusal(coupled, method):
-    """Eq. (5) distributes a sum over two flexions; here there is nothing to distribute."""
+    """Eq. (5) distributes a sum over two flexions, which this hand does not have."""
     with pytest.raises(ik.errors.UnsupportedError) as caught:
         ik.Solver(coupled, method)
     assert str(caught.value) == (
@@ -349,7 +349,7 @@ def test_paper_methods_explain_refusal(coupled, method):
 
 
 def test_grasps_of_other_robots_are_unreachable(coupled, robot):
-    """Fifteen equations for eleven motors: a cup pinched with free distal joints does not fit."""
+    """Eleven motors cannot meet fifteen equations of a pinch of independent distal joints."""
     grasp = ik.load_grasp("cup")
     assert ik.Solver(robot).solve(grasp).success
     assert not ik.Solver(coupled, tolerance=ik.Tolerance(1e-4, 1e-3)).solve(grasp).success

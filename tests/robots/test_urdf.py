@@ -1,4 +1,4 @@
-"""The written URDF, read by pinocchio."""
+"""The written URDF in pinocchio."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_limits_and_velocities(pair):
 
 
 def test_mimic_joints_stand_for_the_linear_couplings(pair, rng):
-    """With mimic joints on, only what they leave free has to be set."""
+    """With mimic joints only the independent joints are set."""
     robot, _ = pair
     model = pin.buildModelFromXML(robot.urdf(), mimic=True)
     data = model.createData()

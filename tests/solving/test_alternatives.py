@@ -1,4 +1,4 @@
-"""Several solutions of one grasp: that they are solutions, all of them, and ranked as asked."""
+"""Several solutions of one grasp: valid, complete, and in the requested order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from toy_robots import grasp_at, grasp_of
 import casadi_ik as ik
 
 MIN_DIFFERENCE, DISTINCT = 0.25, 0.05
-"""Least differences of answers unless said otherwise, and of hands that are searched."""
+"""Minimal difference of answers by default, and of searched hands."""
 
 
 def contains(interval, swivels):
@@ -43,7 +43,7 @@ def test_alternatives_are_distinct_solutions(robot, solver):
 
 
 def differences(robot, first, second):
-    """(k, l) the largest motion of a motor from one solution to another, in ranges."""
+    """Return the largest motion of a motor between solutions (k, l), in ranges."""
     first_q, second_q = (
         np.stack([solution.q for solution in solutions]) for solutions in (first, second)
     )
@@ -58,14 +58,14 @@ def min_difference(robot, solutions):
 
 @pytest.mark.parametrize("prefer", ["limits", "manipulability", "q0"])
 def test_cup_alternatives_differ(robot, solver, prefer):
-    """The hand has a continuum of postures; without a minimum distance they fill the list."""
+    """The hand has a continuum of postures, which fill the list without a minimal distance."""
     cup = ik.load_grasp("cup")
     all_solutions = solver.solve_all(cup, limit=1000, prefer=prefer, apart=0)
     assert min_difference(robot, all_solutions) < 0.1
     few = solver.solve_all(cup, limit=4, prefer=prefer)
     assert len(few) == 4
     assert min_difference(robot, few) >= MIN_DIFFERENCE
-    # Each that is left out is like one before it.
+    # Each solution that is left out is similar to an earlier one.
     different_solutions = solver.solve_all(cup, limit=1000, prefer=prefer)
     assert [solution.branch for solution in different_solutions[:4]] == [
         solution.branch for solution in few
@@ -80,7 +80,7 @@ def test_cup_alternatives_differ(robot, solver, prefer):
 
 @pytest.mark.slow
 def test_min_separation_is_a_parameter():
-    """On a robot whose arm is only nearly of a closed form."""
+    """The robot has an arm that is only nearly of a closed form."""
     robot = ik.load_robot("baxter_ar10")
     grasp = grasp_at(robot, robot.random(np.random.default_rng(1), 1)[0])
     solver = ik.Solver(robot)
@@ -182,7 +182,7 @@ def test_bad_alternative_options_are_refused(robot, solver):
 
 @pytest.mark.slow
 def test_arms_of_a_hand_with_a_wrist():
-    """The wrist makes two joints more than a closed form takes: all its branches are there."""
+    """The wrist has two joints more than a closed form takes; all its branches are included."""
     robot = ik.load_robot("ur5e+shadow")
     solver = ik.Solver(robot)
     for q in robot.random(np.random.default_rng(3), 3):

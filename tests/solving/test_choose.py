@@ -1,4 +1,4 @@
-"""Of many grasps those that are best to take."""
+"""Choice of the best of many grasps."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def cup() -> ik.Grasp:
 
 @pytest.fixture(scope="module")
 def candidates(cup) -> list[ik.Grasp]:
-    """The cup's grasp turned about the cup, in the cup's frame; some of them out of reach."""
+    """Return grasps of the cup turned about it, in its frame; some of them are out of reach."""
     cup_in_frame = cup.in_object_frame()
     angles = np.linspace(0, 2 * np.pi, COUNT, endpoint=False)
     return [
@@ -55,7 +55,7 @@ def test_ranking_is_sorted_by_score(solver, robot, candidates, cup, prefer):
     np.testing.assert_allclose(scores, scored(robot, q, prefer, robot.home), atol=1e-12)
     assert (np.diff(scores) <= 0).all()
     assert len(ranked) > 5
-    # One after the other nobody does better.
+    # Single solves of the candidates are not better.
     single_rankings = [
         solver.choose([choice], cup.object_pose, robot.home, 1, prefer) for choice in candidates
     ]
@@ -101,7 +101,7 @@ def test_object_frame_candidates_match_moved_ones(solver, candidates, cup):
     placed = [candidate.at(cup.object_pose) for candidate in candidates]
     ranked_placed = solver.choose(placed)
     ranked_by_pose = solver.choose(candidates, object_pose=cup.object_pose)
-    # Of candidates that are equal but for rounding either may be first.
+    # Of candidates that are equal up to rounding, either may be first.
     scores = [
         [candidate.score for candidate in ranked] for ranked in (ranked_by_pose, ranked_placed)
     ]
@@ -112,7 +112,7 @@ def test_object_frame_candidates_match_moved_ones(solver, candidates, cup):
         np.testing.assert_allclose(
             candidate.solution.q, q_by_candidate[candidate.candidate], atol=1e-6
         )
-    # A candidate that says where its object is moves with it.
+    # A candidate with an object pose moves with it.
     ranked_moved = solver.choose(
         [cup, *candidates], object_pose=cup.object_pose, limit=50, apart=0, per_candidate=None
     )
@@ -173,7 +173,7 @@ def test_reasons_are_counted(robot, candidates, cup):
 
 
 def test_given_hand_ranks_the_arm_alone(solver, robot, rng):
-    """The hand's distance from its limits is nobody's choice."""
+    """The limit margin of the hand is the same for all answers."""
     hand = slice(7, None)
     q = robot.random(rng, 30)
     q[:, hand] = np.where(rng.random(q[:, hand].shape) < 0.3, robot.upper[hand], q[:, hand])

@@ -1,4 +1,4 @@
-"""The diagnosis of what cannot be solved: right reasons, right numbers, never a false alarm."""
+"""Diagnosis of unsolved targets: right reasons, right numbers, never a false alarm."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ STARTS = 2
 
 @pytest.fixture(scope="module")
 def solver(robot: ik.ArmHand) -> ik.Solver:
-    """Hand-first with the usual tolerance."""
+    """Hand-first solver with the default tolerance."""
     return ik.Solver(robot)
 
 
 @pytest.fixture(scope="module")
 def cup(robot: ik.ArmHand) -> tuple[Array, Array]:
-    """Contacts that can be reached."""
+    """Contacts within reach."""
     return ik.load_grasp("cup").arrays(robot.fingers)
 
 
 def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.solve.Diagnosis:
-    """The diagnosis of a target that is not solved; called unreachable only with a proof."""
+    """Return the diagnosis of an unsolved target; it is unreachable only with a proof."""
     batch = solver.solve_batch(points[None], normals[None], diagnose=True)
     (diagnosis,) = batch.diagnoses
     assert diagnosis is not None
@@ -43,7 +43,7 @@ def diagnosed(solver: ik.Solver, points: Array, normals: Array) -> ik.solve.Diag
 
 
 def proved(solver: ik.Solver, points: Array, normals: Array) -> ik.solve.Diagnosis:
-    """The diagnosis of a target that is to be called unreachable."""
+    """Return the diagnosis of a target that is proved unreachable."""
     diagnosis = diagnosed(solver, points, normals)
     assert diagnosis.established
     assert "proved for" in "\n".join(diagnosis.lines)
@@ -51,7 +51,7 @@ def proved(solver: ik.Solver, points: Array, normals: Array) -> ik.solve.Diagnos
 
 
 def at_limits(robot: ik.ArmHand, rng: np.random.Generator, count: int, part: float) -> Array:
-    """Configurations with a part of the actuators at their limits."""
+    """Return configurations with a part of the actuators at their limits."""
     q = robot.random(rng, count)
     chance = rng.random(q.shape)
     q = np.where(chance < part / 2, robot.lower, q)
@@ -59,7 +59,7 @@ def at_limits(robot: ik.ArmHand, rng: np.random.Generator, count: int, part: flo
 
 
 def stretched(robot: ik.ArmHand, rng: np.random.Generator, count: int) -> Array:
-    """The same with the arm at 99.9 % of its length."""
+    """Return such configurations with the arm at 99.9 % of its length."""
     q, a, b = at_limits(robot, rng, count, 0.3), 0.4, 0.39
     cosine = ((0.999 * (a + b)) ** 2 - a * a - b * b) / (2 * a * b)
     q[:, 3] = np.arccos(cosine) * rng.choice([-1, 1], count)
@@ -101,7 +101,7 @@ def test_too_far(
 def test_object_in_the_shoulder(
     solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array, Array]
 ) -> None:
-    """The elbow would have to bend farther than it can; lifting its limit proves it."""
+    """The elbow would have to bend beyond its limit; lifting that limit proves it."""
     points = cup[0] - cup[0].mean(axis=0) + [0, 0, 0.31]
     diagnosis = proved(solver, points, cup[1])
     assert diagnosis.reason is ik.solve.Reason.REACH
@@ -203,7 +203,7 @@ def test_reachable_thanks_to_tolerance(solver: ik.Solver, robot: ik.ArmHand) -> 
 
 
 def test_diagnosis_matches_brute_force(solver: ik.Solver, robot: ik.ArmHand) -> None:
-    """Whole grasps shifted, contacts shifted, normals turned: about half can be reached."""
+    """Whole grasps are shifted, contacts shifted, or normals turned: about half can be reached."""
     rng = np.random.default_rng(13)
     points, normals = robot.contacts(robot.random(rng, 40))
     points[:16] += rng.normal(0, 0.3, (16, 1, 3))
@@ -228,7 +228,7 @@ def test_diagnosis_matches_brute_force(solver: ik.Solver, robot: ik.ArmHand) -> 
 
 
 def test_other_methods_use_hand_first(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
-    """Not converging says nothing about reach."""
+    """A method that does not converge has not shown that a target is out of reach."""
     options = {"max_iterations": 2}
     paper = ik.Solver(robot, "enhanced-dls", finger_step="closed-form", options=options)
     solution = paper.solve(ik.load_grasp("cup"))
@@ -262,7 +262,7 @@ def test_nearest_contacts(solver: ik.Solver, robot: ik.ArmHand, cup: tuple[Array
 
 
 def impossible(robot: ik.ArmHand, count: int) -> tuple[Array, Array]:
-    """Targets of several kinds, most of them out of reach."""
+    """Return targets of several kinds, most of them out of reach."""
     rng = np.random.default_rng(21)
     points, normals = robot.contacts(robot.random(rng, 4 * count))
     points[:count] += [1.0, 0, 0]
@@ -299,20 +299,20 @@ def test_remedies_survive_pickling(solver: ik.Solver, cup: tuple[Array, Array]) 
 
 
 def residual(q: Array, robot: ik.ArmHand, points: Array, normals: Array) -> Array:
-    """Errors of the points by 0.1 m, and of the normals."""
+    """Return errors of the points divided by 0.1 m, and of the normals."""
     p, n = robot.contacts(q)
     return np.concatenate([((p - points) / 0.1).ravel(), (n - normals).ravel()])
 
 
 def parts(q: Array, robot: ik.ArmHand, points: Array, normals: Array) -> Array:
-    """Every error as a part of its tolerance."""
+    """Return every error divided by its tolerance."""
     p, n = robot.contacts(q)
     angles = 2 * np.arcsin(np.linalg.norm(n - normals, axis=1) / 2)
     return np.concatenate([np.linalg.norm(p - points, axis=1) / 5e-3, angles / np.deg2rad(3)])
 
 
 def largest_part(robot: ik.ArmHand, points: Array, normals: Array, q: Array) -> float:
-    """The largest error as a part of its tolerance, made small from q by a high power."""
+    """Return the largest error divided by its tolerance, minimised from q by a high power."""
     limits = robot.lower, robot.upper
     size = parts(q, robot, points, normals).max()
     fair = least_squares(
@@ -322,7 +322,7 @@ def largest_part(robot: ik.ArmHand, points: Array, normals: Array, q: Array) -> 
 
 
 def best_of_restarts(robot: ik.ArmHand, points: Array, normals: Array, q: Array) -> Array:
-    """The best that scipy finds from random starts and from a given configuration."""
+    """Return the best configuration of scipy from random starts and a given configuration."""
     limits = robot.lower, robot.upper
     starts = [*robot.random(np.random.default_rng(0), STARTS), np.clip(q, *limits)]
     results = [
@@ -334,7 +334,7 @@ def best_of_restarts(robot: ik.ArmHand, points: Array, normals: Array, q: Array)
 
 @pytest.fixture(scope="module")
 def bent(tmp_path_factory: pytest.TempPathFactory) -> ik.ArmHand:
-    """The arm with its elbow off the links: no closed form."""
+    """Arm with an offset elbow and without a closed form."""
     return derived_robot(tmp_path_factory.mktemp("bent"), wrist_offset=0.045)
 
 
@@ -401,7 +401,7 @@ def test_arm_without_a_closed_form(bent: ik.ArmHand) -> None:
     assert diagnosis.reason is ik.solve.Reason.HAND
     assert diagnosis.established
 
-    # What such an arm can span is not known: too far is seen, but not called by its name.
+    # The reach of such an arm is unknown: a distant target is found, but not proved.
     far_batch = batch_of(solver, points[None] + [3.0, 0, 0], normals[None])
     (diagnosis,) = far_batch.diagnoses
     assert not far_batch.success[0]
@@ -412,7 +412,7 @@ def test_arm_without_a_closed_form(bent: ik.ArmHand) -> None:
 
 
 def test_a_bad_start_never_makes_it_unreachable(robot: ik.ArmHand) -> None:
-    """The diagnosis of what a method that gives up at once hands it."""
+    """The diagnosis starts from the result of a method that gives up at once."""
     rng = np.random.default_rng(6)
     q = robot.random(rng, 1200)
     q = np.where(rng.random(q.shape) < 0.4, robot.lower, q)

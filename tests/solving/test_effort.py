@@ -1,4 +1,4 @@
-"""How long is tried what cannot be reached, and what q0 in degrees is told."""
+"""Effort for unreachable targets, and the hint for q0 in degrees."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import casadi_ik as ik
 from casadi_ik import errors
 
 CANDIDATES = 8
-"""Hand postures of a round."""
+"""Hand postures per restart."""
 
 
 @pytest.fixture(scope="module")
 def far_targets(robot):
-    """Contacts that can nearly be reached, and some that can."""
+    """Return contacts that can nearly be reached, and some that can."""
     rng = np.random.default_rng(7)
     points, normals = robot.contacts(robot.random(rng, 60))
     points[:30] += rng.normal(0, 0.02, points[:30].shape)
@@ -46,7 +46,7 @@ def test_invalid_limits_are_refused(robot):
 
 
 def test_palms_out_of_the_arms_reach_are_not_searched(robot, rng):
-    """Such palms used all restarts although their hand is given: up to 100 ms each."""
+    """Unreachable palms once used all restarts although the hand is fixed: up to 100 ms each."""
     q = robot.random(rng, 80)
     palms = robot.palm(q)
     palms[40:, :3, 3] *= 1.0 / np.linalg.norm(palms[40:, :3, 3], axis=1, keepdims=True) * 1.6
@@ -55,7 +55,7 @@ def test_palms_out_of_the_arms_reach_are_not_searched(robot, rng):
     assert batch.success[:40].all()
     assert not batch.success[40:].any()
     assert batch.restarts.max() < CANDIDATES
-    # A palm at the very end of what the tolerance allows is no less looked for.
+    # A palm at the edge of its tolerance gets the same effort.
     straight = np.zeros(len(robot.lower))
     straight[7:] = robot.home[7:]
     end = robot.palm(straight)[None]

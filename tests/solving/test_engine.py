@@ -1,4 +1,4 @@
-"""The engine around a method that answers what it is told: verdict, threads, record."""
+"""The engine around a method with given answers: verdict, threads, record."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from casadi_ik.solve.verdict import judge
 
 
 class Answering:
-    """Gives for every target the q0 it was given, and the status it was made with."""
+    """Method that returns q0 of every target with a given status."""
 
     name, trace_format = "answering", None
     preferences, hand_search = (), None
@@ -51,7 +51,7 @@ def targets(robot, q, q0, enforce=True):
 
 @pytest.mark.parametrize("enforce", [True, False])
 def test_limits_are_part_of_success_where_enforced(robot, enforce):
-    """The method is sure of itself, the contacts are met, but a motor is beyond its limit."""
+    """The method reports success and the contacts are met, but a motor exceeds its limit."""
     q = np.tile(robot.home, (2, 1))
     q[1, 6] = robot.upper[6] + 0.01
     batch = Engine(robot, Answering()).solve(targets(robot, q, q, enforce), SolveOptions())
@@ -75,7 +75,7 @@ def test_verdict_overrides_the_method(robot, status):
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_every_solve_is_recorded_once_and_in_order(robot, rng, jobs):
-    """In parts, with the rows of their own iterations."""
+    """Solves are recorded in parts, each with the rows of its iterations."""
     points, normals = robot.contacts(robot.random(rng, 300))
     recorder = TraceRecorder()
     batch = ik.Solver(robot).solve_batch(points, normals, jobs=jobs, log=recorder)
@@ -157,7 +157,7 @@ def test_limits_of_every_motor(robot):
 
 
 def test_limits_of_a_coupled_joint(own_robot):
-    """A joint narrower than its motor counts on its own."""
+    """A joint with narrower limits than its motor is judged by its own limits."""
     hand = own_robot.with_name("hand.yaml")
     text = hand.read_text()
     at = text.index("name: bh_finger_3_spread")

@@ -1,4 +1,4 @@
-"""One target a call: the same answers, bit for bit, as those of a batch."""
+"""Single targets by `fast` have the same answers, bit for bit, as in a batch."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from casadi_ik import errors
 
 @pytest.fixture(scope="module")
 def targets(robot):
-    """Targets at limits, some out of reach so that every round is made, some partly free."""
+    """Return targets at limits, some out of reach, some partly free."""
     rng = np.random.default_rng(7)
     q = robot.random(rng, 400)
     ends = np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper)

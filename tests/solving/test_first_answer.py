@@ -1,4 +1,4 @@
-"""The first answers of a robot, while its C is compiled in the background."""
+"""First answers of a robot, while its C code is compiled in the background."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SOLVE = """
 
 
 def run(cache: Path, policy: str, scene: str = "None") -> tuple[np.ndarray, str]:
-    """The answer of another process, and what it says."""
+    """Return the answer of another process, and its output."""
     changed = {"CASADI_IK_CACHE": str(cache), "CASADI_IK_COMPILE": policy}
     done = python("-c", SOLVE.format(scene=scene), env=changed, check=True)
     return np.array(done.stdout.split(), dtype=float), done.stderr
@@ -44,7 +44,7 @@ def loops(cache: Path) -> list[Path]:
 
 
 def workers(cache: Path) -> list[int]:
-    """Processes that compile into a cache."""
+    """Function that starts processes with a cache of their own."""
     workers_found = []
     for place in Path("/proc").glob("[0-9]*"):
         try:

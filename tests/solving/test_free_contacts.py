@@ -1,4 +1,4 @@
-"""Contacts that leave the palm free: two fingers that face each other, a finger alone."""
+"""Contacts that leave the palm free: two opposed fingers, or one finger."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_arm_with_a_tool():
 
 
 def test_chain_as_one_finger(tmp_path: Path) -> None:
-    """A robot's file of a single chain is taken for a hand of one finger on a base."""
+    """A file of a single chain becomes a hand of one finger on a base."""
     file = tmp_path / "chain.urdf"
     file.write_text(ik.load_robot("puma560").urdf())
     description = tmp_path / "chain.yaml"

@@ -1,4 +1,4 @@
-"""Ctrl-C in the middle of batches: threads stop, and what a stream has finished was handed over."""
+"""Ctrl-C during batches: threads stop, and finished blocks of a stream are delivered."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ SCRIPT = """
 def test_threads_stop_at_an_interrupt(
     method: str, count: int, diagnose: bool, compiled: bool
 ) -> None:
-    """Each whole batch takes minutes even on an idle machine; a busy one gets some patience."""
+    """Each whole batch takes minutes; the limit of the interrupt allows for a busy machine."""
     script = SCRIPT.format(
         method=method, count=count, diagnose=diagnose, compiled=compiled, noise=int(diagnose)
     )

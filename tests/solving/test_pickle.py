@@ -1,4 +1,4 @@
-"""What is sent to other processes arrives as what it was."""
+"""Results and solvers survive sending to other processes."""
 
 from __future__ import annotations
 

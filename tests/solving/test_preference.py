@@ -1,6 +1,6 @@
-"""From where the robot is to the nearest solution: nothing moves in vain, and paths do not jump.
+"""The solution nearest to the current configuration: small motions, and paths without jumps.
 
-Mostly in the virtual machine, whose iterates are those of compiled code.
+Most tests use the virtual machine, whose iterates are those of compiled code.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from casadi_ik import errors
 
 
 def distance(robot, q, q0):
-    """Euclidean distance, every motor as a part of its range."""
+    """Return the Euclidean distance with every motor divided by its range."""
     return np.linalg.norm((q - q0) / (robot.upper - robot.lower), axis=-1)
 
 
 def path(robot, rng, steps):
-    """Configurations along a smooth motion whose contacts move by about 0.25 mm a step."""
+    """Return configurations along a smooth motion whose contacts move by about 0.25 mm per step."""
     start = robot.lower + (robot.upper - robot.lower) * rng.uniform(0.3, 0.7, len(robot.lower))
     direction = rng.normal(size=len(start)) * (robot.upper - robot.lower)
     points = [robot.contacts(start + sign * 1e-6 * direction)[0] for sign in (0, 1)]
@@ -28,7 +28,7 @@ def path(robot, rng, steps):
 
 
 def test_small_path_steps_cause_no_jump(robot, rng):
-    """The largest step was 208 degrees before."""
+    """Before, the largest step was 208 degrees."""
     solver = ik.Solver(robot, tolerance=EXACT, compiled=False)
     for _ in range(4):
         path_targets = path(robot, rng, 40)

@@ -1,4 +1,4 @@
-"""A preference, and where the robot is, order answers: they never decide whether there is one."""
+"""Preferences and starts order answers, and never decide whether one exists."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_success_is_independent_of_preference(seed, robot, scene):
     for prefer, row in product(preferences(solver), range(0, COUNT, 3)):
         solution = solver.solve(grasps[row], q0=all_starts["random"], prefer=prefer, diagnose=False)
         assert solution.success == success["random"][row], prefer
-    # A start that is an answer says more than the target does: it may add, and never costs one.
+    # A start that is an answer may add answers, and never removes one.
     batch_from_truth = solver.solve_batch(points, normals, q0=truth)
     assert not (usual.success & ~batch_from_truth.success).any()
     assert batch_from_truth.success[:-2].sum() >= usual.success[:-2].sum()
@@ -98,7 +98,7 @@ def test_choose_answers_every_solvable_candidate(seed, robot, scene):
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_targets_unreachable_near_q0_are_searched_elsewhere(robot):
-    """Near what the tolerances allow other starts end elsewhere: some of these were lost."""
+    """Near the edge of the tolerances other starts end elsewhere: some of these were missed."""
     solver, rng = solver_of(robot, "none"), np.random.default_rng(7)
     points, normals = solver.robot.contacts(solver.robot.random(rng, 400))
     points += rng.normal(0, 0.004, points.shape)
@@ -119,7 +119,7 @@ def test_targets_unreachable_near_q0_are_searched_elsewhere(robot):
 @pytest.mark.parametrize("grasp", ["shadow_cup", "leap_mustard_bottle"])
 @pytest.mark.parametrize("prefer", ["q0", "limits", "manipulability", "clearance"])
 def test_shipped_grasp_on_a_table(grasp, prefer):
-    """With "q0" it was COLLISION: one hand was looked at, again and again."""
+    """With "q0" it was COLLISION, because one hand was tried repeatedly."""
     shipped_grasp = ik.load_grasp(grasp)
     solution = solver_of(shipped_grasp.robot, "table").solve(shipped_grasp, prefer=prefer)
     assert solution.success, solution.collision

@@ -1,4 +1,4 @@
-"""Unreachable only with a proof: never of what can be reached, and each can be checked again."""
+"""Targets are unreachable only with a proof, never when reachable, and proofs can be verified."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_reachable_targets_are_not_disproved(
         turning = np.array([a.unit == "rad" for a in any_robot.description.actuators])
         q[:, turning] = rng.uniform(-9, 9, (12, turning.sum()))
     angle = 10 * tolerance
-    # Contacts of which only the tolerance makes that they can be reached, too.
+    # Contacts that can be reached only because of the tolerance.
     part = rng.choice([0.0, 0.9, 0.99]) if tolerance > 1e-9 else 0.0
     targets = moved_targets(any_robot.contacts(q), rng, part * tolerance, part * angle)
     problems = batch_of_targets(targets, tolerance, angle, limits)
@@ -117,7 +117,7 @@ def test_ignored_limits_and_tiny_tolerances_give_no_proof(robot: ik.ArmHand) -> 
 
 
 def polynomial_robot(folder: Path) -> ik.ArmHand:
-    """A hand bent by a cam, where the joint turns back within the motor's range."""
+    """Return a hand bent by a cam, where the joint reverses within the range of the motor."""
     path = write_coupled_robot(folder)
     put(
         folder / "parts" / "hand.yaml",
@@ -137,7 +137,7 @@ def polynomial_robot(folder: Path) -> ik.ArmHand:
     ids=["coupled", "bent", "cam"],
 )
 def test_coupled_mechanisms_and_other_arms(tmp_path: Path, make_robot) -> None:
-    """Chains of couplings, a prismatic thumb, an arm without a closed form."""
+    """Robots have chains of couplings, a prismatic thumb, or an arm without a closed form."""
     robot = make_robot(tmp_path)
     rng, prover = np.random.default_rng(5), Prover(robot.description)
     q = robot.random(rng, 200)
@@ -158,7 +158,7 @@ def test_coupled_mechanisms_and_other_arms(tmp_path: Path, make_robot) -> None:
     ends=st.lists(st.floats(-4, 4), min_size=2, max_size=2),
 )
 def test_polynomial_bounds_hold(coefficients: list[float], ends: list[float]) -> None:
-    """Both arithmetics, and as sharply as the interval is short."""
+    """Both arithmetics give bounds, which are sharp for short intervals."""
     low, high = sorted(ends)
     value = COUPLING_ROWS[Polynomial].bounds(
         coupling := Polynomial("a", tuple(coefficients)), *map(np.atleast_1d, (low, high))
@@ -169,7 +169,7 @@ def test_polynomial_bounds_hold(coefficients: list[float], ends: list[float]) ->
     for lower_bound, upper_bound in (graph, (value[0][0], value[1][0])):
         assert lower_bound <= values.min()
         assert values.max() <= upper_bound
-    # The width of a monomial over the interval bounds what is lost.
+    # The width of a monomial over the interval bounds the loss.
     size = sum(abs(c) * k * 4.0 ** (k - 1) for k, c in enumerate(coefficients))
     for lower_bound, upper_bound in (graph, (value[0][0], value[1][0])):
         assert upper_bound - lower_bound <= 4 * size * (high - low) + 1e-9 * (10 + size)
@@ -211,7 +211,7 @@ def test_finger_of_a_fixed_hand() -> None:
 
 
 def test_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
-    """Even one that was sealed anew after what was changed in it."""
+    """A changed proof fails also when it is sealed again."""
     targets = impossible(robot)
     separation, shoulder = (
         prover.prove(batch_of_targets(targets[name], 5e-3, np.deg2rad(3), True))[0]
@@ -228,7 +228,7 @@ def test_corrupted_proof_fails(robot: ik.ArmHand, prover: Prover) -> None:
     assert not replace(separation, fingers=("nobody",)).sealed().check(robot)
     assert not replace(separation, target=reachable).sealed().check(robot)
     assert not separation.check(robot, reachable)
-    # Without the arm nothing is wrong with contacts in the shoulder.
+    # Without the arm, contacts in the shoulder are valid.
     assert not replace(shoulder, kind=ProofKind.HAND).sealed().check(robot)
 
 
@@ -243,7 +243,7 @@ def test_every_number_of_a_proof_matters(robot: ik.ArmHand, prover: Prover) -> N
 
 
 def test_shoulder_in_the_palm_frame(robot: ik.ArmHand, prover: Prover) -> None:
-    """Nearer than the elbow bends: half a million boxes did not show it, now some hundred do."""
+    """The palm is nearer than the elbow bends: before, half a million boxes did not prove it."""
     points = [[0.077, 0.033, 0.422], [-0.098, -0.059, 0.317], [-0.037, 0.008, 0.542]]
     normals = np.array([[-0.849, -0.424, 0.316], [0.462, -0.108, 0.88], [0.013, 0.06, -0.998]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -256,7 +256,7 @@ def test_shoulder_in_the_palm_frame(robot: ik.ArmHand, prover: Prover) -> None:
 
 
 def test_box_bounds_hold_inside_the_box(robot: ik.ArmHand, prover: Prover) -> None:
-    """Rows of pairs of contacts and the distance of shoulder and wrist; some of them nearly so."""
+    """Return rows of contact pairs and of shoulder and wrist, some nearly feasible."""
     rng = np.random.default_rng(3)
     bounds, closest = _bounds(prover), 0.0
     for _ in range(300):
@@ -283,7 +283,7 @@ def test_box_bounds_hold_inside_the_box(robot: ik.ArmHand, prover: Prover) -> No
 
 
 def _bounds(prover: Prover) -> ca.Function:
-    """Values and widths of the rows, and the ends of the distance of shoulder and wrist."""
+    """Return values and widths of the rows, and the ends of the distance of shoulder and wrist."""
     h = len(prover.space.coordinates)
     shapes = {"lower": (h, 1), "upper": (h, 1), "points": (3, 3), "normals": (3, 3)}
     shapes |= {"tolerance": (3, 2), "constrained": (3, 2)}
@@ -303,7 +303,7 @@ def _bounds(prover: Prover) -> ca.Function:
 def test_limits_of_shoulder_and_wrist_are_part_of_the_reach(
     robot: ik.ArmHand, prover: Prover
 ) -> None:
-    """Palms that only a wrist 0.8 rad beyond its limit would hold."""
+    """Return palms that need a wrist 0.8 rad beyond its limit."""
     rng = np.random.default_rng(12)
     q, wrist = robot.random(rng, 8), robot.actuators.index("lwr_joint_6")
     q[:, wrist] = robot.upper[wrist] + 0.8
@@ -320,7 +320,7 @@ def test_limits_of_shoulder_and_wrist_are_part_of_the_reach(
 def test_unproved_targets_are_not_unreachable(
     robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The best answer, the starts tried and the likely reason, marked as such."""
+    """The lines state the best answer, the number of starts and the likely reason as such."""
     solver = ik.Solver(robot)
     monkeypatch.setattr(
         solver._engine.diagnostician._prover,
@@ -339,7 +339,7 @@ def test_unproved_targets_are_not_unreachable(
 
 
 def test_near_misses_use_few_boxes(robot: ik.ArmHand, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such targets are excluded only by small boxes; each took a quarter of a second."""
+    """Only small boxes exclude these targets; each took a quarter of a second."""
     solver, boxes = ik.Solver(robot), []
     prove = solver._engine.diagnostician._prover.prove
 

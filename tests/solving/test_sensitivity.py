@@ -1,4 +1,4 @@
-"""Derivatives of answers: against answers of targets nearby, found by numpy alone; the layers."""
+"""Derivatives of answers compared with answers of nearby targets in numpy; the layers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STEP = 1e-5
 
 
 def jacobian(robot, q, known_rows):
-    """Rows of points [0.1 m] and normals that count, by central differences."""
+    """Return constrained rows of points [0.1 m] and normals, by central differences."""
     columns = []
     for motor in range(len(q)):
         ends = [robot.contacts(q + side * 1e-6 * np.eye(len(q))[motor]) for side in (1, -1)]
@@ -23,7 +23,7 @@ def jacobian(robot, q, known_rows):
 
 
 def answer(robot, q, free, known_rows, points, normals, scales):
-    """The nearest answer by Newton's method, with motors that may move, in units of scales."""
+    """Return the nearest answer by Newton's method over movable motors, in units of scales."""
     for _ in range(12):
         at = robot.contacts(q)
         left = np.concatenate(
@@ -80,7 +80,7 @@ def test_sensitivity_matches_nearby_answers(name, case):
 
 
 def test_gradients_and_other_kinds(robot):
-    """A gradient gives the same as all derivatives; a plane leaves motions along it free."""
+    """A gradient equals the product of all derivatives; a plane leaves motions along it free."""
     solver, rng = ik.Solver(robot), np.random.default_rng(5)
     q, gradient = robot.random(rng, 5), rng.normal(size=(5, 14))
     targets = robot.contacts(q)
@@ -121,7 +121,7 @@ def targets(robot):
 
 @pytest.fixture(scope="module")
 def expected(robot, targets):
-    """Answers and derivatives of the sum of their squares."""
+    """Return answers and derivatives of the sum of their squares."""
     solver = ik.Solver(robot)
     batch = solver.solve_batch(*targets, q0=robot.home)
     rates = solver.sensitivity(batch.q, *targets, 2 * batch.q)

@@ -1,4 +1,4 @@
-"""What answers print, and show in notebooks."""
+"""Printed results, and results in notebooks."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_tables_need_no_plotting(robot, monkeypatch):
 
 @pytest.mark.opengl
 def test_a_solution_draws_itself(own_robot, tmp_path):
-    """Also of a robot that is not shipped; what is reached, unless it is said what was asked."""
+    """Robots need not be shipped; without a target, the reached contacts are shown."""
     solution = ik.Solver(ik.load_robot(own_robot)).solve(ik.load_grasp("cup"))
     path = tmp_path / "cup.png"
     assert solution.draw(path=path, dpi=40).axes

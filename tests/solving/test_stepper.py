@@ -1,4 +1,4 @@
-"""A solve by hand gives the iterates of the loop."""
+"""A solve by single steps gives the iterates of the loop."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def stepped_solver(robot) -> ik.Solver:
 
 
 def same_as_the_log(solver: ik.Solver, grasp: ik.Grasp, path: Path) -> ik.Solution:
-    """The steps made by hand are the iterations in the log, and lead to the same end."""
+    """The steps are the iterations in the log, and have the same end."""
     solution = solver.solve(grasp, log=path, diagnose=False)
     rows = ik.logs.open(path).iterations().rows
     stepper = solver.stepper(grasp)
@@ -32,7 +32,7 @@ def same_as_the_log(solver: ik.Solver, grasp: ik.Grasp, path: Path) -> ik.Soluti
     np.testing.assert_array_equal(stepper.state["q"], solution.q)
     for record, row in zip(records, rows, strict=True):
         assert set(record) <= set(row.dtype.names)
-        # What else is in a log is measured of finished traces.
+        # The other fields of a log are measured on finished traces.
         extra_fields = set(row.dtype.names) - set(record)
         assert all(name.startswith(("sigma_", "condition_")) for name in extra_fields)
         np.testing.assert_array_equal(record["q"], row["q"])
@@ -50,13 +50,13 @@ def test_steps_match_the_log(robot, method: str, tmp_path) -> None:
 
 @pytest.mark.parametrize("method", ["hand-first", "thumb-first"])
 def test_steps_cover_all_restarts(robot, method: str, tmp_path) -> None:
-    """A target out of reach takes every start there is; by hand as well as in the loop."""
+    """A target out of reach uses all starts, by steps as in the loop."""
     solver = ik.Solver(robot, method)
     points, normals = ik.load_grasp("sugar_box").arrays(robot.fingers)
     far_grasp = grasp_of(robot, points + np.array([0.0, 0.0, 3.0]), normals)
     solution = same_as_the_log(solver, far_grasp, tmp_path / "x.mcap")
     assert solution.status is ik.Status.STALLED
-    # Six rounds of eight hands from tables and five from anywhere.
+    # Six restarts of eight hands from tables and five global ones.
     expected = 8 * (6 + 5) if method == "hand-first" else 32
     assert solution.restarts == expected - 1
 

@@ -1,4 +1,4 @@
-"""Success depends on the question alone: not on options that order answers or explain them."""
+"""Success depends on the target alone, not on options that order or explain answers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import casadi_ik as ik
 
 COUNT = 12
 SHARE = 0.8
-"""Share of the tolerance by which contacts are displaced from those of a configuration."""
+"""Fraction of the tolerance by which contacts are displaced from those of a configuration."""
 
 TOLERANCES = [ik.Tolerance(5e-3, np.deg2rad(angle)) for angle in (3, 30)]
 
 
 @pytest.fixture(scope="module", params=["kuka_lwr_barrett", "ur10e+robotiq_2f85", "dclaw"])
 def robot(request) -> ik.ArmHand:
-    """An arm with a three-finger hand, an arm with a gripper, and a hand alone."""
+    """Robots: an arm with a three-finger hand, an arm with a gripper, and a hand alone."""
     return ik.load_robot(request.param)
 
 
@@ -70,6 +70,6 @@ def unsolved(robot: ik.ArmHand, tolerance: ik.Tolerance) -> dict[str, list[int]]
 
 @pytest.mark.parametrize("tolerance", TOLERANCES, ids=["3 deg", "30 deg"])
 def test_success_depends_on_the_target_only(robot, tolerance):
-    """The configuration that a target was made from solves it."""
+    """The configuration that generated a target solves it."""
     failures = {call: rows for call, rows in unsolved(robot, tolerance).items() if rows}
     assert not failures

@@ -1,4 +1,4 @@
-"""What the algebra tests share: strategies, graphs as functions, derivatives two ways."""
+"""Strategies, graphs as functions, and derivatives for the tests of algebra."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ rotation_vectors = st.builds(lambda angle, axis: angle * axis, angles, unit_vect
 
 
 def graph(f, *shapes) -> ca.Function:
-    """Function of SX symbols of these shapes; a tuple of results becomes several outputs."""
+    """Return a Function of SX symbols; a tuple of results becomes several outputs."""
     symbols = [ca.SX.sym(f"x{i}", *shape) for i, shape in enumerate(shapes)]
     results = f(*symbols)
     results = list(results) if isinstance(results, tuple) else [results]
@@ -32,7 +32,7 @@ def graph(f, *shapes) -> ca.Function:
 
 
 def gradient(f, *shapes) -> ca.Function:
-    """AD Jacobian of all results of f with respect to all its arguments."""
+    """Return the Jacobian of all results of f with respect to all its arguments, by CasADi."""
     symbols = [ca.SX.sym(f"x{i}", *shape) for i, shape in enumerate(shapes)]
     results = f(*symbols)
     results = list(results) if isinstance(results, tuple) else [results]
@@ -42,7 +42,7 @@ def gradient(f, *shapes) -> ca.Function:
 
 
 def central_difference(f: ca.Function, *arguments, step: float = 1e-6) -> np.ndarray:
-    """Jacobian of all outputs of f with respect to all its arguments, by central differences."""
+    """Return the Jacobian of all outputs of f by central differences."""
     flat = np.concatenate([np.ravel(np.array(x, float), order="F") for x in arguments])
 
     def value(x: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ def central_difference(f: ca.Function, *arguments, step: float = 1e-6) -> np.nda
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
-    """Uniformly distributed rotation matrix."""
+    """Return a uniformly distributed rotation matrix."""
     q = rng.standard_normal(4)
     w, x, y, z = q / np.linalg.norm(q)
     return np.array(

@@ -1,4 +1,4 @@
-"""The equations of Chandra et al. 2019, as they are printed and on the AR10."""
+"""The printed equations of Chandra et al. 2019, also on the AR10."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ EQUATIONS = {
 
 @pytest.fixture(scope="module")
 def toy(coupled_robot) -> ik.ArmHand:
-    """Sliders, a four-bar, linear couplings, a shared motor, a prismatic joint."""
+    """Robot with sliders, a four-bar, linear couplings, a shared motor, and a prismatic joint."""
     return coupled_robot
 
 
@@ -56,7 +56,7 @@ def evaluated(*expressions, q, at):
 
 
 def twist_by_differences(tip: TipChain, at: np.ndarray, step: float = 1e-6) -> np.ndarray:
-    """Columns [v; w] = 2 x' x* over all actuators, x' by central differences."""
+    """Return columns [v; w] = 2 x' x* over all actuators, x' by central differences."""
     q = ca.SX.sym("q", len(at))
     pose = ca.Function("pose", [q], [tip.evaluate(q).pose])
     columns = []
@@ -94,7 +94,7 @@ def test_eqs_1_2_screw_leaves_its_line_invariant(w, distance_along, axis, point,
 
 @pytest.mark.parametrize("kind", ["toy", "barrett"])
 def test_eqs_3_to_7_12_finger_jacobians_are_the_tips_twist(kind, toy, robot, rng):
-    """In slider space against differences; in joint space against the joints' own rates."""
+    """Jacobians equal differences over actuators, and the geometric Jacobians over joints."""
     body = toy if kind == "toy" else robot
     q = ca.SX.sym("q", len(body.actuators))
     for finger in body.fingers:
@@ -125,7 +125,7 @@ def test_eqs_3_to_7_12_finger_jacobians_are_the_tips_twist(kind, toy, robot, rng
 
 
 def test_eq_12_is_the_display_of_the_paper(toy, rng):
-    """A finger of lead screw, lead screw and four-bar: [s_1, s_2 + f s_3], plus what follows."""
+    """Two lead screws and a four-bar have the columns [s_1, s_2 + f s_3] and followers."""
     q = ca.SX.sym("q", len(toy.actuators))
     tip = finger_chain(toy.description, "left")
     assert tip.drivers == ("left_spread", "left_1", "left_2")
@@ -140,7 +140,7 @@ def test_eq_12_is_the_display_of_the_paper(toy, rng):
 
 
 def test_eqs_8_10_rates_are_those_of_the_couplings(toy, rng):
-    """The closed forms of every coupling against the derivative of the joint positions."""
+    """The closed forms of every coupling equal the derivative of the joint positions."""
     q = ca.SX.sym("q", len(toy.actuators))
     body = actuated(toy.description, q)
     for finger in toy.fingers:
@@ -156,7 +156,7 @@ def test_eqs_8_10_rates_are_those_of_the_couplings(toy, rng):
 
 
 def test_eqs_15_16_relative_jacobian(toy, robot, rng):
-    """Against the difference of both tips' twists, and against central differences."""
+    """The Jacobian equals the difference of both tips' twists, and central differences."""
     for body, reference, finger in (
         (toy, "left", "thumb"),
         (toy, "left", "right"),
@@ -192,7 +192,7 @@ def test_eqs_15_16_relative_jacobian(toy, robot, rng):
 
 
 def test_eqs_15_16_signs_and_columns(toy):
-    """Four joints move the thumb against the finger that eq. (15) prints with three columns."""
+    """Four joints move the thumb relative to the finger that eq. (15) prints with three columns."""
     tip = relative_chain(toy.description, "left", "thumb")
     assert tip.chain.joints == (
         *("left_4", "left_3", "left_2", "left_1", "left_spread"),
@@ -220,7 +220,7 @@ def test_reference_pose_is_that_of_all_joints_at_zero(robot):
     start = np.array(dq.translation(ca.DM(chain.reference))).ravel()
     np.testing.assert_allclose(start, points[0], atol=1e-15)
     np.testing.assert_allclose(chain.screws[0].moment, 0, atol=1e-15)
-    # Joint 2 turns about -y at the shoulder's height.
+    # Joint 2 turns about -y at the height of the shoulder.
     np.testing.assert_allclose(chain.screws[1].moment, [0.3105, 0, 0], atol=1e-15)
     with pytest.raises(ik.errors.UnknownNameError, match="no finger 'x'"):
         screw_chain_to_contact(robot.description, "x")

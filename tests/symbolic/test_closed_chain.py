@@ -1,4 +1,4 @@
-"""The arm and the reversed thumb as one closed chain: its Jacobians, mobility and active joints."""
+"""Arm and reversed thumb as one closed chain: Jacobians, mobility and active joints."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SPREAD, THUMB_1, THUMB_2 = 7, 8, 9
 
 @pytest.fixture(scope="module", params=[(1, "arm-leg"), (1, "palm"), (2, "palm"), (0, "arm-leg")])
 def chain(request, robot):
-    """The chain's matrices and the Jacobians they are checked with, as one Function of q."""
+    """Matrices of the chain and reference Jacobians, as a Function of q."""
     borrowed, platform = request.param
     q, step = ca.SX.sym("q", 14), ca.SX.sym("step", 4)
     body = actuated(robot.description, q)
@@ -51,7 +51,7 @@ def chain(request, robot):
 
 
 def samples(robot, rng, evaluate, count=25):
-    """Configurations away from the chain's singularities, with a random active step each."""
+    """Return configurations away from singularities, with a random active step each."""
     chains = []
     for q in robot.random(rng, 20 * count):
         step = rng.normal(size=4)
@@ -95,7 +95,7 @@ def test_thumb_keeps_its_contact(chain, robot, rng):
         normal = values["normal"].ravel()
         slip = np.cross(jacobian[3:] @ motors, normal)
         assert np.linalg.norm(slip) < 1e-9 * np.linalg.norm(rotation_bound)
-        # It turns about its normal though, at the virtual joint's rate.
+        # It turns about its normal at the rate of the virtual joint.
         assert abs(normal @ jacobian[3:] @ motors) > 1e-6
 
 
@@ -104,7 +104,7 @@ def test_virtual_joint_rotates_about_the_normal(chain, robot, rng):
     at = parts.active.index(VIRTUAL)
     for _, step, values in samples(robot, rng, evaluate, 5):
         spin = values["normal"].ravel() @ values["thumb"][3:] @ values["motors"].ravel()
-        # Reversed: the hand turns about the resting tip as the tip would turn in the hand.
+        # Reversed: the hand turns about the resting tip like the tip would turn in the hand.
         assert spin == pytest.approx(step[at], rel=1e-7, abs=1e-9)
 
 
@@ -120,7 +120,7 @@ def test_active_motors_take_their_step(chain, robot, rng):
 
 
 def test_jacobian_is_the_platforms_twist(chain, robot, rng):
-    """J_cc times the active step is what the arm's Jacobian makes of the motors' steps."""
+    """J_cc times the active step is the arm's Jacobian times the steps of the motors."""
     _, _, evaluate = chain
     for _, step, values in samples(robot, rng, evaluate):
         expected = values["platform"] @ values["motors"].ravel()
@@ -136,14 +136,14 @@ def ranks(jacobian) -> int:
 def test_palm_has_rank_three_and_link_6_rank_four(chain, robot, rng):
     """The fourth mobility leaves the palm at rest."""
     parts, platform, evaluate = chain
-    # Nothing borrowed, the arm leg ends at the palm as well.
+    # Without a borrowed joint the arm leg ends at the palm as well.
     expected = 3 if platform == "palm" or len(parts.arm_leg) == 7 else 4
     for _, _, values in samples(robot, rng, evaluate, 10):
         assert ranks(values["J_cc"]) == expected
 
 
 def matrices(robot, platform="palm"):
-    """``q -> C, J_cc, motor steps, thumb's linear and angular rows, normal`` as a Function."""
+    """Return the Function of q: C, J_cc, motor steps, rows of the thumb, normal."""
     n = len(robot.actuators)
     q = ca.SX.sym("q", n)
     body, parts = actuated(robot.description, q), split(robot.description)
@@ -171,7 +171,7 @@ def test_pivoting_finds_rank_and_independent_columns(rng):
 
 @pytest.fixture(scope="module", params=[1, 2, 3, 4])
 def derived(request, tmp_path_factory):
-    """The shipped arm with a thumb of one to four joints."""
+    """Shipped arm with a thumb of one to four joints."""
     return request.param, thumb_of(tmp_path_factory.mktemp("thumb"), request.param)
 
 
@@ -187,7 +187,7 @@ def test_mobility_is_computed(derived, rng):
 
 
 def test_palm_moves_as_the_thumb_permits(derived, rng):
-    """Rank of the palm's J_cc: virtual joint and thumb, six at most; the elbow adds nothing."""
+    """The rank of the palm's J_cc is that of virtual joint and thumb, at most six."""
     joints, robot = derived
     _, evaluate = matrices(robot)
     checked = 0
@@ -202,7 +202,7 @@ def test_palm_moves_as_the_thumb_permits(derived, rng):
 
 
 def test_the_chain_is_the_null_space_of_the_thumbs_rows(derived, rng):
-    """Virtual joint and reversed thumb against three rows of the point and two of the normal."""
+    """The chain spans the null space of three rows of the point and two of the normal."""
     joints, robot = derived
     _, evaluate = matrices(robot)
     columns = [*robot.description.arm_actuators, *robot.description.finger_actuators(robot.thumb)]
@@ -221,7 +221,7 @@ def test_the_chain_is_the_null_space_of_the_thumbs_rows(derived, rng):
 
 
 def test_h_rows_two_to_six_belong_to_the_arm(robot, rng):
-    """Not h_1 to h_5, as eq. (8) prints: with q_p of eq. (7) the first row is the thumb's."""
+    """With q_p of eq. (7) the first row is the thumb's, unlike in eq. (8) as printed."""
     q = ca.SX.sym("q", 14)
     body, parts = actuated(robot.description, q), split(robot.description)
     chain = closed_chain(body, parts)
@@ -252,7 +252,7 @@ ROWS = ContactRows(point_normal_kinds(3))
 
 @pytest.fixture(scope="module")
 def problem(robot):
-    """``(q, points, normals, weights) -> linear problem`` as a Function."""
+    """Function (q, points, normals, weights) -> linear problem."""
     q, points = ca.SX.sym("q", 14), ca.SX.sym("points", 3, 3)
     normals, weights = ca.SX.sym("normals", 3, 3), ca.SX.sym("weights", 3, 2)
     p = {"points": points, "normals": normals, "weights": weights}
@@ -263,7 +263,7 @@ def problem(robot):
 
 @pytest.fixture(scope="module")
 def steps(problem):
-    """Both solvers as Functions ``(linear, lower, upper, damping) -> step, held``."""
+    """Both solvers as Functions (linear, lower, upper, damping) -> step, multipliers."""
     shapes = [problem.size_out(i) for i in range(4)] + [(14, 1), (14, 1), (1, 1)]
     symbols = [ca.MX.sym("x", *shape) for shape in shapes]
     return [
@@ -275,7 +275,7 @@ def steps(problem):
 
 
 def cases(robot, rng, problem, count):
-    """Linear problems near their targets, the hand near its limits."""
+    """Yield linear problems near their targets, with the hand near its limits."""
     for q in robot.random(rng, count):
         q[7:] = np.where(rng.random(7) < 0.3, robot.lower[7:] + 0.02, q[7:])
         goal = np.clip(q + rng.uniform(-0.2, 0.2, 14), robot.lower, robot.upper)
@@ -285,7 +285,7 @@ def cases(robot, rng, problem, count):
 
 
 def test_unlimited_variants_take_the_same_step(robot, problem, steps, rng):
-    """The projector's formula is the minimiser under the thumb's equations."""
+    """The formula of the projector is the minimiser under the equations of the thumb."""
     unlimited = np.full(14, WIDE)
     for damping in (0.03, 1.0):
         for _, linear in cases(robot, rng, problem, 15):
@@ -296,18 +296,18 @@ def test_unlimited_variants_take_the_same_step(robot, problem, steps, rng):
             assert not np.array(multipliers).any()
             np.testing.assert_allclose(step_a, step_b, atol=1e-5 * max(1.0, np.abs(step_a).max()))
             thumb, error, rows, other_rows = linear
-            # The thumb gets what its own damped step would give it.
+            # The thumb moves as its own damped step would move it.
             damped = thumb @ thumb.T + max(THUMB_DAMPING, damping) ** 2 * np.eye(5)
             expected_step = thumb @ thumb.T @ np.linalg.solve(damped, error)
             np.testing.assert_allclose(thumb @ step_a, expected_step.ravel(), atol=1e-6)
-            # And no motion of the closed chain would serve the others better.
+            # No motion of the closed chain would reduce the other errors further.
             null = np.linalg.svd(thumb)[2][5:].T
             slope = null.T @ (rows.T @ (rows @ step_a - other_rows.ravel()) + damping**2 * step_a)
             assert np.abs(slope).max() < 1e-4 * np.abs(null.T @ rows.T @ other_rows).max() + 1e-9
 
 
 def test_both_variants_keep_limits(robot, problem, steps, rng):
-    """Bound joints are at their limits, and the thumb keeps its position as well as possible."""
+    """Bound joints are at their limits, and the thumb keeps its contact as well as possible."""
     fixed, agree, total = 0, 0, 0
     for q, linear in cases(robot, rng, problem, 40):
         lower, upper = robot.lower - q, robot.upper - q
@@ -327,7 +327,7 @@ def test_both_variants_keep_limits(robot, problem, steps, rng):
         agree += np.abs(step_a - step_b).max() < 1e-3
         total += 1
     assert fixed > 10
-    # Joints once fixed are not let go again, which the program may do: seldom another answer.
+    # Fixed joints are not released, unlike in the program: the answers rarely differ.
     assert agree > 0.7 * total
 
 

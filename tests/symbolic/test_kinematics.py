@@ -1,4 +1,4 @@
-"""Forward kinematics and Jacobians over the motors, against pinocchio and central differences."""
+"""Forward kinematics and Jacobians over the motors, compared with pinocchio and differences."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def pair(request, robot, oracle, coupled_robot, coupled_oracle):
 
 
 def inner(robot, rng, count):
-    """Configurations far enough from the limits for central differences of sliders."""
+    """Return configurations with a margin to the limits for central differences of sliders."""
     margin = 0.02 * (robot.upper - robot.lower)
     return rng.uniform(robot.lower + margin, robot.upper - margin, (count, len(robot.actuators)))
 
 
 def over_q(robot, build) -> ca.Function:
-    """Function of q of what `build` makes of the actuated kinematics."""
+    """Return a Function of q of the result of `build` on the actuated kinematics."""
     q = ca.SX.sym("q", len(robot.actuators))
     outputs = build(actuated(robot.description, q))
     outputs = outputs if isinstance(outputs, (tuple, list)) else [outputs]
@@ -36,7 +36,7 @@ def numbers(f: ca.Function, q) -> list[np.ndarray]:
 
 
 def difference(f, q, step=1e-6) -> np.ndarray:
-    """Central differences of an array-valued f, last axis over q."""
+    """Return central differences of an array-valued f, last axis over q."""
     columns = []
     for i in range(len(q)):
         h = np.zeros(len(q))
@@ -46,7 +46,7 @@ def difference(f, q, step=1e-6) -> np.ndarray:
 
 
 def spin(pose_of, q, step=1e-6) -> np.ndarray:
-    """Angular velocity (3, n) in the base frame of a rotation-valued function."""
+    """Return the angular velocity (3, n) in the base frame of a rotation-valued function."""
     R = pose_of(q)
     rate = difference(pose_of, q, step)
     hat = np.einsum("ijn,kj->ikn", rate, R)

@@ -1,4 +1,4 @@
-"""Small solves, steps within bounds and singular values as graphs, against numpy and scipy."""
+"""Small linear systems, bounded steps and singular values, against numpy and scipy."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ VALUES = {shape: graph(la.singular_values, shape) for shape in SHAPES}
 
 
 def samples(rng: np.random.Generator, m: int, n: int, count: int):
-    """Matrices of full rank, with singular values over 14 decades, scaled rows, low rank, 0."""
+    """Yield matrices of full rank, ill-conditioned, with scaled rows, low rank, and 0."""
     k = min(m, n)
     for i in range(count):
         A = rng.standard_normal((m, n))
@@ -209,7 +209,7 @@ M, N, FIRST = 9, 7, 3
 
 @pytest.fixture(scope="module")
 def step():
-    """(J, r, damping, value, lower, upper, passes) -> step, promised."""
+    """Function (J, r, damping, value, lower, upper, passes) -> step, predicted decrease."""
     J, r, damping = ca.SX.sym("J", M, N), ca.SX.sym("r", M), ca.SX.sym("damping")
     value, lower, upper = (ca.SX.sym(name, N - FIRST) for name in ("value", "lower", "upper"))
     functions = {}
@@ -228,22 +228,22 @@ def step():
 
 
 def problem(rng, tight):
-    """A problem whose solution has some coordinates at bounds, or none."""
+    """Return a problem whose solution has some coordinates at bounds, or none."""
     J, r = rng.normal(size=(M, N)), rng.normal(size=M)
     lower, upper = -rng.uniform(0, tight, N - FIRST), rng.uniform(0, tight, N - FIRST)
     value = rng.uniform(lower, upper)
-    # Some stand at a bound to begin with.
+    # Some coordinates start at a bound.
     at = rng.integers(0, 4, N - FIRST)
     value = np.where(at == 0, lower, np.where(at == 1, upper, value))
     return J, r, rng.uniform(1e-6, 1e-1), value, lower, upper
 
 
 def exact(J, r, damping, value, lower, upper):
-    """The same problem by scipy."""
+    """Return the solution of the same problem by scipy."""
     matrix = np.vstack([J, np.sqrt(damping) * np.eye(N)])
     right = np.concatenate([-r, np.zeros(N)])
     free = np.full(FIRST, np.inf)
-    # lsq_linear wants lower < upper and an interior: bounds are widened by next to nothing.
+    # lsq_linear needs lower < upper and an interior: bounds are widened slightly.
     low = np.concatenate([-free, lower - value]) - 1e-13
     high = np.concatenate([free, upper - value]) + 1e-13
     return lsq_linear(matrix, right, (low, high), method="bvls", tol=1e-14).x
@@ -270,7 +270,7 @@ def test_enough_passes_give_the_exact_solution(step, rng, tight):
         assert (new_value <= upper + 1e-12).all()
         same_count += np.allclose(s, expected, atol=1e-6)
         bound_count += np.sum((new_value <= lower + 1e-12) | (new_value >= upper - 1e-12))
-    # The method is no cure-all for any quadratic, but nearly so for a handful of coordinates.
+    # The method is not exact for all quadratics, but nearly so for a few coordinates.
     assert same_count >= 95
     assert bound_count > 50
 
@@ -322,7 +322,7 @@ FINGERS, JOINTS, PALM = 5, 4, 6
 
 @pytest.mark.parametrize("full", [0, 3])
 def test_sparse_problem_matches_the_dense_one(rng, full):
-    """Rows that concern all coordinates aside, fingers share no more than their palm."""
+    """Apart from rows of all coordinates, fingers share only their palm."""
     count = PALM + FINGERS * JOINTS
     J = fingers()
     r, damping = ca.SX.sym("r", J.shape[0]), ca.SX.sym("damping")
@@ -355,7 +355,7 @@ def test_sparse_problem_matches_the_dense_one(rng, full):
 
 
 def fingers():
-    """A Jacobian of fingers with joints of their own on a palm that moves them all."""
+    """Return a Jacobian of fingers with joints of their own on a palm that moves them all."""
     rows = []
     for i in range(FINGERS):
         finger_columns = [ca.SX(6, JOINTS) for _ in range(FINGERS)]

@@ -32,7 +32,7 @@ toggle = graph(lambda phi, b: mechanisms.linkage_toggle(phi, bar(b)), S, B)
 
 
 def linkages(count: int, seed: int = 3):
-    """Random linkages of both branches, at least 1e-3 of sin^2 away from a toggle."""
+    """Yield random linkages of both branches, at least 1e-3 of sin^2 away from a toggle."""
     rng = np.random.default_rng(seed)
     found_count = 0
     while found_count < count:
@@ -200,7 +200,7 @@ def turn(axis: int, angle: float) -> np.ndarray:
 
 
 def contact(finger, q) -> tuple[np.ndarray, np.ndarray]:
-    """Contact point and normal in the palm frame from the constants alone."""
+    """Return contact point and normal in the palm frame from the constants alone."""
     spread = (
         0.0
         if finger.spread_motor is None

@@ -1,4 +1,4 @@
-"""Rotations, rigid transforms and dual quaternions against pinocchio and scipy.
+"""Rotations, rigid transforms and dual quaternions, compared with pinocchio and scipy.
 
 Pinocchio's Motion is [v; w] as well.
 """
@@ -209,7 +209,7 @@ SPECIAL = [np.array(v, float) for v in ([0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1
 
 
 def rotated_line(n: np.ndarray, w: np.ndarray, theta: float) -> tuple[np.ndarray, np.ndarray]:
-    """The unit axis perpendicular to n nearest to w, and n turned about it by theta."""
+    """Return the unit axis perpendicular to n nearest to w, and n turned about it by theta."""
     axis = np.cross(n, np.cross(w, n))
     axis /= np.linalg.norm(axis)
     return axis, np.cos(theta) * n + np.sin(theta) * np.cross(axis, n)
@@ -230,7 +230,7 @@ def test_error_turns_current_into_desired(n, w, theta):
     if np.linalg.norm(np.cross(n, w)) < 0.1:
         return
     axis, d = rotated_line(n, w, theta)
-    # Rounding the two normals moves their angle by about 1e-16, hence the direction by 1e-16/sin.
+    # Rounding of the normals changes their angle by about 1e-16, and the axis by 1e-16 / sin.
     slack = 1e-15 / max(np.sin(theta), 1e-15)
     assert abs(float(angle(n, d)) - theta) < 1e-15
     e = error(n, d).full()[:, 0]

@@ -20,7 +20,7 @@ def solver():
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch):
-    """Keep meshes in a folder of the test."""
+    """Folder for the meshes of a test."""
     monkeypatch.setenv("CASADI_IK_CACHE", str(tmp_path))
 
 

@@ -17,7 +17,7 @@ from casadi_ik.planning.touch.strength import (
 
 
 def test_loads_match_linear_programs(grasps_found):
-    """With the same soft fingers, on the exact cylinder: close, since normals are sampled."""
+    """Loads of the same soft fingers on the exact cylinder are close, since normals are sampled."""
     grasp = grasps_found[1][0]
     points = np.array([c.point for c in grasp.grasp.contacts.values()]) - PLACE[:3, 3]
     normals = -points * [1, 1, 0]
@@ -41,7 +41,7 @@ def test_loads_match_linear_programs(grasps_found):
         cost[-1] = -1
         force_limits = [[1.0] * wrenches.shape[1] + [0.0]]
         max_loads.append(-linprog(cost, force_limits, [1.0], program_columns, np.zeros(6)).fun)
-    # As the object gives way, some of it is lost.
+    # A compliant object reduces the load.
     assert 0.25 * min(max_loads) < grasp.load < 1.25 * min(max_loads) + 0.02
 
 
@@ -87,7 +87,7 @@ EXACTLY = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 
 
 @pytest.mark.parametrize("radius", [0.0, 0.012])
 def test_rotational_stiffness_falls_with_squeeze_force(radius):
-    """Two springs on a line: 2 k R^2 against turning, less 2 F (R - radius)."""
+    """Two springs on a line have the stiffness 2 k R^2 against rotation, less 2 F (R - radius)."""
     k, half_width, force = 400.0, 0.04, 6.0
     normals = np.array([[[1.0, 0, 0], [-1.0, 0, 0]]])
     jacobians = np.eye(6).reshape(1, 2, 3, 6)
@@ -122,7 +122,7 @@ def test_forces_balance_within_friction(grasps_found):
         contacts = grasp.grasp.contacts
         forces = np.array([grasp.forces[name] for name in contacts])
         points = np.array([contact.point for contact in contacts.values()])
-        # The can's exact normals, on its side or on a lid.
+        # The exact normals of the can, on its side or a lid.
         local = points - PLACE[:3, 3]
         lid = np.abs(local[:, 2]) > 0.0495
         inward = -np.where(lid[:, None], local * [0, 0, 1], local * [1, 1, 0])
@@ -130,7 +130,7 @@ def test_forces_balance_within_friction(grasps_found):
         pressed = (forces * inward).sum(axis=1)
         slid = np.linalg.norm(forces - pressed[:, None] * inward, axis=1)
         np.testing.assert_allclose(forces.sum(axis=0), 0, atol=1e-6)
-        # What is left is held by the pads' torsion: at most 2/3 mu 5 mm of 1 N.
+        # The rest is held by the torsion of the pads: at most 2/3 mu 5 mm of 1 N.
         torque = np.cross(points - PLACE[:3, 3], forces).sum(axis=0)
         assert np.linalg.norm(torque) < 2 / 3 * grasps.mu * 5e-3 + 1e-3
         assert pressed.sum() == pytest.approx(1.0, abs=0.03)
@@ -138,7 +138,7 @@ def test_forces_balance_within_friction(grasps_found):
 
 
 def test_squeeze_matches_equal_springs(grasps_found):
-    """A squeeze moves motors in proportion to the torques of the forces, by virtual work."""
+    """By virtual work, a squeeze moves motors in proportion to the torques of the forces."""
     grasps = grasps_found[1]
     robot = grasps_found[0].robot
     for grasp in grasps[:3]:
@@ -227,7 +227,7 @@ def test_motor_torques_limit_the_squeeze(surface):
 
 @pytest.mark.slow
 def test_enveloping_fingers_support_the_object(surface, tmp_path):
-    """Only finger links lean on it, no deeper than permitted; plain scenes refuse these hands."""
+    """Only finger links lean on the object, no deeper than permitted."""
     robot, deep = ik.load_robot("panda+leap"), 0.006
     text = f"enveloping: {deep}\n{ik.load_scene('table').text()}"
     (tmp_path / "leaning.yaml").write_text(text)

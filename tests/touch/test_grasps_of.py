@@ -32,7 +32,7 @@ def test_written_grasps_match(grasps_found):
 
 
 def test_neighbouring_obstacles_are_avoided(surface):
-    """A wall, a post and a cloud of points close by, told apart by their exact distances."""
+    """Scene of a wall, a post and a cloud of points close by, with their exact distances."""
     cloud = np.stack(np.meshgrid([0.47, 0.5, 0.53], [0.02], [0.03, 0.06, 0.09]), -1).reshape(-1, 3)
     scene = ik.Scene(
         {
@@ -52,7 +52,7 @@ def test_neighbouring_obstacles_are_avoided(surface):
 
 
 def test_fingertips_touch_the_mesh(grasps_found):
-    """By distances of the pads, balls or points, to the exact cylinder."""
+    """The distances of pads, balls or points to the exact cylinder are those claimed."""
     solver, grasps = grasps_found
     inverse = np.linalg.inv(PLACE)
     for grasp in grasps:
@@ -81,7 +81,7 @@ def test_fingertips_touch_the_mesh(grasps_found):
 
 @pytest.mark.slow
 def test_no_pad_extends_beyond_an_edge():
-    """By distances of balls to an exact box, lying so that its long edges are at hand."""
+    """The distances of balls to an exact box are those claimed; its long edges are at hand."""
     solver, pose = solver_of("panda+leap"), np.eye(4)
     pose[:3, :3] = [[0.5, 0, 0.5 * 3**0.5], [0.5 * 3**0.5, 0, -0.5], [0, 1, 0]]
     pose[:3, 3] = [0.5, 0.1, 0.047]
@@ -170,7 +170,7 @@ def test_lifted_object_is_placed_elsewhere(grasps_found):
     motion, part = down.motion, down.motion.notes["part"]
     assert list(dict.fromkeys(part.tolist())) == ["carrying", "lowering", "opening", "leaving"]
     np.testing.assert_array_equal(motion.q[0], up.motion.q[-1])
-    # The object is held as it was, and stands where it was to be.
+    # The object keeps its pose in the hand, and ends where it was placed.
     in_palm = np.linalg.inv(robot.palm(grasp.q)) @ PLACE
     carried_poses = robot.palm(motion.q[(part == "carrying") | (part == "lowering")]) @ in_palm
     np.testing.assert_allclose(carried_poses[-1], to, atol=3e-3)
@@ -257,7 +257,7 @@ def test_bad_queries_are_refused(surface, options, expected):
     ],
 )
 def test_protruding_parts_cost_no_grasps(tmp_path, corners):
-    """A speck is no part, a label a thin one."""
+    """A speck is not a part; a label is a thin one."""
     body = trimesh.creation.cylinder(0.033, 0.1, sections=64)
     both = trimesh.util.concatenate([body, trimesh.Trimesh(corners, [[0, 1, 2]])])
     grasps_found = solver_of("panda+panda_hand").grasps_of(

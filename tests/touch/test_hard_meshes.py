@@ -1,4 +1,4 @@
-"""Meshes that are double-sided, fine, of many pieces, or of very unequal triangles."""
+"""Meshes that are double-sided, fine, in many pieces, or with very unequal triangles."""
 
 import re
 import sys

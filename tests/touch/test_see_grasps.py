@@ -1,4 +1,4 @@
-"""Grasps that are found, as a picture, on a page, and from the command line."""
+"""Found grasps in a picture, on a page, and from the command line."""
 
 from __future__ import annotations
 

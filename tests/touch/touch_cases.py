@@ -1,4 +1,4 @@
-"""A cylinder on a table, and solvers of the tests of grasps of surfaces."""
+"""Cylinder on a table, and solvers for the tests of grasps of surfaces."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Pages that several tests use; each is built once."""
+"""Pages for several tests, each built once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ fingers:  # xyz [m]
 
 @pytest.fixture(scope="session")
 def cup_viewer(robot: ik.ArmHand) -> Iterator[viewing.Viewer]:
-    """The cup on the shipped robot, a table about it."""
+    """Page of the cup with the shipped robot and a table."""
     viewer = viewing.view_grasp(robot, ik.load_grasp("cup"), scene=ik.load_scene("table"))
     yield viewer
     viewer.stop()
@@ -45,7 +45,7 @@ def cup_viewer(robot: ik.ArmHand) -> Iterator[viewing.Viewer]:
 
 @pytest.fixture
 def cup(cup_viewer: viewing.Viewer) -> Iterator[viewing.Viewer]:
-    """The same, as it was at the beginning."""
+    """The page of the cup in its initial state."""
     cup_viewer.page.reset()
     assert cup_viewer.page.work.settle(300)
     yield cup_viewer
@@ -54,7 +54,7 @@ def cup(cup_viewer: viewing.Viewer) -> Iterator[viewing.Viewer]:
 
 @pytest.fixture
 def description(tmp_path: Path) -> Path:
-    """A hand of two fingers with guessed pads."""
+    """Description of a hand of two fingers with guessed pads."""
     fingers = (("first", -0.04, -1), ("second", 0.04, 1))
     links = "".join(FINGER.format(name=name, y=y, x=x) for name, y, x in fingers)
     (tmp_path / "hand.urdf").write_text(URDF.format(links=links))
@@ -65,7 +65,7 @@ def description(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def pads(description: Path) -> Iterator[viewing.Viewer]:
-    """The page of these pads."""
+    """Page of these pads."""
     viewer = viewing.view_pads(description)
     yield viewer
     viewer.stop()

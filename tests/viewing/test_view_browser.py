@@ -1,4 +1,4 @@
-"""Pages used by mouse in a real browser."""
+"""Pages used by mouse in a browser."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ KNOWN_COMPLAINTS = (
     "RenderTargets",
     "preventDefault",
 )
-"""What viser's client says of itself, and of a browser without a graphics card."""
+"""Messages of viser's client, and of a browser without a graphics card."""
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def opened(browser: Browser, viewer: viewing.Viewer, painted: bool = False) -> t
         time.sleep(0.1)
     client = list(server.get_clients().values())[-1]
     page.wait("document.querySelector('.ik-status, .ik-iteration, .ik-pad') !== null")
-    # That there is no graphics card is told in a note that lies over the picture.
+    # A note about the missing graphics card covers the picture.
     page.evaluate("document.querySelector('.mantine-Notification-closeButton')?.click()")
     return page, client
 
@@ -76,7 +76,7 @@ def pixel(page: Page, client: Any, point: np.ndarray) -> np.ndarray:
 
 
 def drag_along(page: Page, client: Any, view: Any, name: str, distance: float) -> None:
-    """Drag that arrow of what is called so that is seen longest, so far [m]."""
+    """Drag the arrow of a handle that appears longest by a distance [m]."""
     pose, size = view.request.poses[name], view._handles._controls[name].handle.scale
     start_pixel = pixel(page, client, pose[:3, 3])
     tips = [pixel(page, client, pose[:3, 3] + size * pose[:3, i]) for i in range(3)]
@@ -99,7 +99,7 @@ def text_of(page: Page, of: str) -> str:
 
 
 def press(page: Page, label: str, of: str = "button") -> None:
-    """Press what has a label, by mouse, once it stays where it is."""
+    """Press the element with a label by mouse, once it does not move."""
     rectangle = (
         f"(() => {{ const b = [...document.querySelectorAll({of!r})]"
         f".find(b => b.innerText.trim() === {label!r}); b?.scrollIntoView({{block: 'center'}});"
@@ -114,7 +114,7 @@ def press(page: Page, label: str, of: str = "button") -> None:
 
 
 def arrived(file: Path) -> None:
-    """A file that the browser saves is there."""
+    """Wait until the browser has saved a file."""
     end = time.monotonic() + 180
     while not file.is_file() and time.monotonic() < end:
         time.sleep(0.05)
@@ -126,7 +126,7 @@ def test_dragged_object_and_contact_are_reached(cup: viewing.Viewer, browser: Br
     time.sleep(1.5)  # the camera comes to rest
     assert text_of(page, ".ik-status") == "SOLVED"
     view, robot = cup.page, cup.page.robot
-    # The object is the first handle, and takes its contacts along.
+    # The object is the first handle, and moves its contacts.
     place = view.request.object_pose[:3, 3]
     point_before = view.request.grasp.contacts["thumb"].point
     drag_along(page, client, view, "object", 0.02)
@@ -148,7 +148,7 @@ def test_dragged_object_and_contact_are_reached(cup: viewing.Viewer, browser: Br
     assert view.result.success
     tip = robot.contacts(view.result.q)[0][robot.fingers.index("thumb")]
     assert np.linalg.norm(tip - point_target) <= 5e-3
-    # And far away: why not is on the page.
+    # After a long drag, the page states the reason of the failure.
     drag_along(page, client, view, "thumb", 0.3)
     page.wait("(document.querySelector('.ik-why')?.innerText ?? '').includes('the contacts')")
     assert view.work.settle(300)
@@ -171,7 +171,7 @@ def test_two_browsers_share_one_drag(cup: viewing.Viewer, browser: Browser, tmp_
         browser_page.wait(f"{finger_text} !== {text_before!r}")
     assert text_of(page, ".ik-finger") == text_of(second_page, ".ik-finger")
     second_page.close()
-    # What is saved is what is asked now, and solves by itself.
+    # The saved grasp is the current one, and is solved alone.
     page.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     press(page, "Files", "[role=tab]")
     press(page, "Save grasp (YAML)")

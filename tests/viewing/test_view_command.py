@@ -1,4 +1,4 @@
-"""`casadi-ik view`: what it opens, and how it refuses what it cannot."""
+"""`casadi-ik view`: opened pages and refusals."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_body_is_moved_part_by_part(view) -> None:
     assert len(named) == len(robot.actuators)
     assert named[:2] == ["base_x [mm]", "base_y [mm]"]
     assert "lwr_joint_1 [°]" in named  # its side is said once, above
-    # The hand is seen where the base has taken it.
+    # The camera of the hand follows the base.
     assert np.linalg.norm(page.cameras()["Hand"].target - robot.palm(q, "arm")[:3, 3]) < 0.15
 
 

@@ -1,4 +1,4 @@
-"""Guessed pads corrected by dragging, and what is written of it."""
+"""Guessed pads corrected by dragging, and the written corrections."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ def test_pad_snaps_to_the_skin(pads: viewing.Viewer) -> None:
     assert page.work.settle(300)
     assert page.message == ""
     pad = page.pads(page.request)["first"]
-    # The box of the last phalanx is 16 mm thick: its side is 8 mm from the middle.
+    # The box of the last phalanx is 16 mm thick, so that its side is 8 mm from the middle.
     assert abs(pad.point[1]) == pytest.approx(0.008, abs=1e-6)
     assert np.allclose(np.abs(pad.normal), [0, 1, 0], atol=1e-6)
-    # Where nothing moves, it is said why.
+    # Without a change, the message states the reason.
     page.snap_to_surface("first")
     assert page.work.settle(300)
     assert page.message.startswith("first: ")

@@ -1,4 +1,4 @@
-"""The page on which contacts are dragged; its handlers are called as a browser calls them."""
+"""The page on which contacts are dragged; its handlers are called like by a browser."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_dragged_contact_and_normal_are_reached(cup: viewing.Viewer) -> None:
     assert faced @ normal / np.linalg.norm(normal) >= np.cos(np.deg2rad(3.0))
     point_target = page.request.grasp.contacts["thumb"].point
     assert np.linalg.norm(tip - point_target) <= page.request.settings.tolerance.position
-    # The nearest answer: no motor goes far for a centimetre.
+    # The answer is the nearest one: no motor moves far for a centimetre.
     assert np.abs(page.result.q - q_before).max() < 0.5
 
 
@@ -77,7 +77,7 @@ def test_unreachable_contact_shows_reason_and_nearest(cup: viewing.Viewer) -> No
     result = page.result
     assert not result.success
     assert result.headline == "UNREACHABLE"
-    # What is drawn is the nearest configuration, and the verdict is that of what is drawn.
+    # The nearest configuration is drawn, and the verdict is that of the drawn configuration.
     points, normals = page.request.grasp.arrays(robot.fingers)
     position, _ = robot.errors(result.q, points, normals)
     errors_shown = [result.verdicts[finger].position_error for finger in robot.fingers]
@@ -96,14 +96,14 @@ def test_drag_beyond_reach_does_not_wait_for_the_diagnosis(
     assert at_once.headline == "NOT MET"
     assert len(at_once.reasons) == 1
     assert at_once.needs_diagnosis
-    # What is drawn at once is as near as what the diagnosis comes to.
+    # The first drawn configuration is as near as the one of the diagnosis.
     far_error, nearest = (
         max(verdict.position_error for verdict in result.verdicts.values())
         for result in results_drawn
     )
     assert nearest > 5e-3
     assert far_error <= 1.05 * nearest
-    # Where nothing nearer is found, the arm stays where it is when the reason comes.
+    # Without a nearer configuration, the arm stays when the reason appears.
     assert np.array_equal(at_rest.q, at_once.q)
     assert at_rest is page.result
     assert at_rest.headline == "UNREACHABLE"
@@ -134,7 +134,7 @@ def test_answers_avoid_a_dragged_table(cup: viewing.Viewer) -> None:
 
 def test_all_solutions_can_be_browsed(cup: viewing.Viewer) -> None:
     page = cup.page
-    # Listed once nothing moves, so after the drag is answered.
+    # Solutions are listed after the drag is answered.
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.0, 0.0, 0.001))
     assert page.work.settle(300)
     assert len(page.solutions) > 1

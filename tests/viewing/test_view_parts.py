@@ -1,4 +1,4 @@
-"""Parts of pages: what a drag makes of a request, the worker, surfaces, texts that are saved."""
+"""Parts of pages: requests after a drag, the worker, surfaces, and saved texts."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_only_the_newest_change_is_applied() -> None:
     work.submit("cup", lambda: done.append("cup"))
     go_on.set()
     assert work.settle(300)
-    # The first was under way; of the five that waited the last is done, and drawn once with "cup".
+    # The first was running; of the five waiting ones the last is run, and drawn once with "cup".
     assert done == ["first", "drawn", "thumb 4", "cup", "drawn", "later"]
     assert work.dropped_count == 4
     work.stop()
@@ -186,7 +186,7 @@ def test_bodies_are_closed_and_wind_outwards() -> None:
         for surface in (body, split_sharp_edges(body)):
             a, b, c = (surface.points[surface.triangles[:, i]] for i in range(3))
             assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 > 0
-            # What is closed has no area in sum.
+            # The area vectors of a closed surface sum to zero.
             assert np.allclose(np.cross(b - a, c - a).sum(axis=0), 0, atol=1e-9)
 
 

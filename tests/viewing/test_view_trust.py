@@ -1,4 +1,4 @@
-"""Pages asked by web pages of others, by clients that are none, and with messages that are none."""
+"""Cross-origin requests, non-browser clients, and malformed messages."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CAMERA = {
 def opened(
     url: str, host: str = "", origin: str | None = None, version: str | None = VERSION
 ) -> Connection:
-    """A websocket to a page's address, as a browser opens it that was led there by a name."""
+    """Open a websocket to the address of a page, like a browser that used another host name."""
     address = urlsplit(url)
     assert address.hostname is not None
     assert address.port is not None
@@ -64,7 +64,7 @@ def greeted(page: Connection) -> bool:
 
 
 def fetch_page(url: str, **headers: str) -> tuple[int, bytes]:
-    """Status and text of a page."""
+    """Return status and text of a page."""
     try:
         with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as response:
             return response.status, response.read()
@@ -109,7 +109,7 @@ def test_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str | N
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
 def test_own_page_is_answered(cup: viewing.Viewer, name: str) -> None:
-    """Also through a tunnel: the port may be another one."""
+    """The page answers through a tunnel with another port, too."""
     address = urlsplit(cup.url)
     assert b"<html" in fetch_page(cup.url, Host=f"{name}:9999")[1].lower()
     for host in (f"{name}:{address.port}", f"{name}:9999"):
@@ -235,6 +235,6 @@ def test_malformed_messages_are_harmless(tmp_path: Path) -> None:
         send(page, good)
         page.ping().wait(120)
     out, err = process.communicate("", timeout=600)
-    # Nothing was said but of the finger that there is none of, and the last message was followed.
+    # There is no error output, and the last message takes effect.
     assert err.splitlines() == []
     assert out.splitlines() == ["[-0.83, 0.15, 0.41]"]

@@ -1,4 +1,4 @@
-"""A robot, a shipped grasp and its solution, made once."""
+"""Robot, shipped grasp and its solution, made once."""
 
 from __future__ import annotations
 

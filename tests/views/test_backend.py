@@ -1,4 +1,4 @@
-"""Pictures in files whatever backend of matplotlib the environment names."""
+"""Pictures in files are independent of the backend of matplotlib in the environment."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Diagrams of a solve: errors in their units, events, limits, a span of a long run."""
+"""Charts of a solve: errors with units, events, limits, a part of a long run."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def test_the_strip_of_events_has_a_row_per_kind_and_jacobian(log) -> None:
 
 @pytest.fixture(scope="module")
 def long_log(robot, tmp_path_factory) -> ik.logs.Log:
-    """A solve next to a straight elbow: 60 iterations, the arm near singular at its start."""
+    """Solve next to a straight elbow: 60 iterations, with a nearly singular arm at the start."""
     path = tmp_path_factory.mktemp("span") / "long.mcap"
     q = robot.home.copy()
     q[robot.actuators.index("lwr_joint_4")] = 1e-3

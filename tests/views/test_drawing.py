@@ -1,4 +1,4 @@
-"""What is drawn: closed surfaces; a body that follows the robot; a camera that shows it."""
+"""Drawings: closed surfaces, bodies that follow the robot, and cameras that show them."""
 
 from __future__ import annotations
 
@@ -210,7 +210,7 @@ def test_without_opengl_there_is_an_error_and_no_crash(monkeypatch) -> None:
 
 
 class NoOpenGL:
-    """A plotter as it is where neither X nor EGL nor OSMesa is installed."""
+    """Plotter on a machine without X, EGL and OSMesa."""
 
     def __init__(self, **_) -> None:
         self.render_window = self

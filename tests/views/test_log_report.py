@@ -1,4 +1,4 @@
-"""A study's log as one page: complete, self-contained, and safe whatever the log is called."""
+"""The log of a study as one page: complete, self-contained, and safe for any name."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def study(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two sets of targets of one method, those of one out of reach."""
+    """Two sets of targets of one method, one of them out of reach."""
     folder = tmp_path_factory.mktemp("study")
     rng = np.random.default_rng(6)
     for name, scale in (("near", 1.0), ("<i>far</i>", 3.0)):
@@ -63,7 +63,7 @@ def test_page(study: Path) -> None:
     rows = {row[1]: row for row in page.cells if len(row) > 8}
     assert rows["near"][2:4] == ["12", "100.00"]
     assert rows["<i>far</i>"][2:4] == ["12", "0.00"]
-    # What is not solved is listed first, and counted by its reason.
+    # Unsolved targets are listed first, and counted by reason.
     first = text.index('<tbody class="solve"')
     assert 'data-status="STALLED"' in text[first : first + 200]
     assert sum(int(row[0]) for row in page.cells if len(row) == 4) == 12

@@ -1,4 +1,4 @@
-"""Pictures of grasps: what is on them, what is written on them, and that they are whole."""
+"""Pictures of grasps: contents, labels, and complete files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def words(figure: Figure) -> str:
 
 
 def count(figure: Figure, color: str) -> int:
-    """Pixels of about this colour in the two views."""
+    """Return the number of pixels of about this colour in both views."""
     hue = mcolors.rgb_to_hsv(mcolors.to_rgb(color))
     pixels = 0
     for axes in figure.axes:
@@ -52,7 +52,7 @@ def test_the_picture_says_how_it_ended(robot, solution, grasp) -> None:
 def test_a_dark_page_has_a_picture_of_its_own(robot, solution, grasp) -> None:
     figure = views.draw_solution(robot, solution, grasp, dpi=20, dark=True)
     assert mcolors.to_hex(figure.get_facecolor()) == palette.DARK_PAPER
-    # Where nothing stands the picture is as dark as what it is on.
+    # Without shapes the picture has the colour of its background.
     assert mcolors.to_hex(figure.axes[1].images[0].get_array()[0, 0]) == palette.DARK_PAPER
     written = [text.get_color() for text in figure.texts]
     assert {palette.DARK_INK, palette.DARK_FAINT} < set(written)
@@ -174,7 +174,7 @@ def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
 
 
 def test_a_scene_is_drawn_with_what_touches_in_red(robot, grasp) -> None:
-    """The ball over the cup is red, because the hand is in it, and the legend says how deep."""
+    """A ball over the cup is red, and the legend states how deep the hand penetrates it."""
     place = grasp.object_pose[:3, 3] + np.array([0.1, 0.0, 0.2])
     solids = {
         "table": {"kind": "box", "size": [2, 2, 0.04], "xyz": [0, 0, -0.02]},
