@@ -17,15 +17,14 @@ from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.contact_batches import group_by_kinds
 from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds
 from casadi_ik.model.grasp import Grasp, real_array
+from casadi_ik.motion.clutch import Clutch, Poses
+from casadi_ik.motion.cycle import CYCLE_TUNING
 from casadi_ik.motion.free_path import motor_units
-from casadi_ik.motion.guard import Guard, stopping_distance
+from casadi_ik.motion.guard import Guard, braked, stopping_distance
 from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
-from casadi_ik.motion.recovery import Recovery
+from casadi_ik.motion.recovery import Recovery, brake
 from casadi_ik.solve.solution import Pair
 from casadi_ik.solve.verdict import TOLERANCE_SLACK
-
-Poses = Mapping[str | None, Array]
-"""Poses of palms (4, 4) by side; the side is None for a single arm-hand."""
 
 
 class FollowStatus(Enum):
@@ -46,7 +45,22 @@ class FollowStatus(Enum):
     BLOCKED = "blocked"
     """The target leads to a collision: the motors stop before it."""
     HOLDING = "holding"
-    """The frame is invalid: the motors decelerate to rest and wait for a valid one."""
+    """The frame is invalid, or the follower is paused: the motors decelerate to rest and wait."""
+
+
+@dataclass(frozen=True, eq=False)
+class Branch:
+    """Configuration that is nearer to the target of a follower than its goal.
+
+    Attributes:
+        q: (n,) configuration [rad or m].
+        gain: Decrease of the largest error over its tolerance.
+        travel: Largest distance of a motor from its present position [rad or m].
+    """
+
+    q: Array
+    gain: float
+    travel: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +105,14 @@ class FollowState:
 
 
 NO_FRAME = "no frame yet"
+
+PAUSED = "paused"
+
+RETURN_SHARE = 0.2
+"""Share of the velocity limits at which motors return from beyond their limits."""
+
+MIN_GAIN = 0.1
+"""Minimum decrease of the error ratio on a better branch, relative to the present one."""
 
 IDENTITY = np.eye(4)
 """Pose that trackers send for a lost hand; a real palm does not coincide with the base frame."""
@@ -162,7 +184,8 @@ class Follower:
         """Restart at rest at a configuration, for a robot that something else has moved.
 
         Args:
-            q: (n,) positions of the motors [rad or m]; clipped to the limits.
+            q: (n,) positions of the motors [rad or m]. Motors beyond their limits return to them at
+                a fifth of their velocity limits.
 
         Raises:
             InputError: Wrong shape or numbers.
@@ -173,10 +196,95 @@ class Follower:
             >>> bool(np.allclose(follower.state.q, solution.q))
             True
         """
-        clipped = self._clipped(q)
-        self._inputs.run.state[:] = self._inputs.state_at(clipped)
+        start = self._plan.target_builder.start(q)
+        self._inputs.run.state[:] = self._inputs.state_at(start)
         self._reason, self._cycles, self._is_stopped = NO_FRAME, 0, False
-        self._recovery.reset(clipped)
+        self._is_paused, self._is_at_rest, self._clutch = False, False, None
+        self._is_beyond_limits = True
+        self._recovery.reset(self._clipped(start))
+
+    def pause(self) -> None:
+        """Open the clutch: the motors decelerate to rest, and targets are ignored.
+
+        `branch` moves the motors also during a pause.
+
+        Example:
+            >>> follower = solver.follow(q0=solution.q)
+            >>> follower.pause()
+            >>> bool((follower(grasp) == solution.q).all()), follower.state.reason
+            (True, 'paused')
+        """
+        self._is_paused, self._is_at_rest, self._reason = True, True, PAUSED
+
+    def resume(self, q: ArrayLike | None = None) -> None:
+        """Close the clutch: the robot moves as the targets move from now on.
+
+        The next points, normals and palm poses are anchored to the contacts and palms of the robot,
+        so that it does not move before the target does. Grasps are absolute targets. The posture of
+        free motions is the present one.
+
+        Args:
+            q: (n,) measured positions of the motors at rest [rad or m], see `reset`; None: the
+                commanded ones.
+
+        Raises:
+            InputError: Wrong shape or numbers.
+
+        Example:
+            >>> follower = solver.follow(q0=robot.home)
+            >>> follower.pause()
+            >>> follower.resume(solution.q)
+            >>> q = follower(*robot.contacts(robot.home))
+            >>> bool(np.allclose(q, solution.q))
+            True
+        """
+        if q is not None:
+            self.reset(q)
+        self._is_paused, self._clutch = False, Clutch(self._plan.robot)
+        self.posture = self._posture_at_rest()
+
+    @property
+    def posture(self) -> Array:
+        """Posture (n,) to which free motions lead, such as one with a preferred elbow [rad or m].
+
+        It is a soft preference: motors move there as far as contacts permit, in the time
+        ``settling``.
+
+        Example:
+            >>> follower = solver.follow(q0=solution.q)
+            >>> follower.posture = robot.home
+        """
+        return self._posture.copy()
+
+    @posture.setter
+    def posture(self, q: ArrayLike) -> None:
+        self._posture = self._clipped(q)
+        for inputs in self._inputs_by_kinds.values():
+            inputs.set_posture(self._posture)
+
+    def better_branch(self) -> Branch | None:
+        """Search for a configuration that is nearer to the present target than the goal is.
+
+        The search takes milliseconds, so it is not part of a cycle, and the follower never changes
+        its branch by itself: `branch` moves to the result.
+
+        Returns:
+            The branch, or None if the target is met or no nearer configuration was found.
+
+        Example:
+            >>> follower = solver.follow(q0=solution.q)
+            >>> q = follower(grasp)
+            >>> follower.better_branch() is None
+            True
+        """
+        ratio, q = self._inputs.goal_error_ratio, self._posture_at_rest()
+        if self._reason or ratio <= 1.0:
+            return None
+        nearest = self._plan.nearest(self._inputs.target(), q)
+        gain = ratio - self._inputs.exact_error_ratio(nearest)
+        if not gain > MIN_GAIN * ratio:
+            return None
+        return Branch(q=nearest, gain=gain, travel=float(np.abs(nearest - q).max()))
 
     def branch(self, q: ArrayLike) -> None:
         """Move to a configuration, usually on another branch, and continue to follow from there.
@@ -199,9 +307,7 @@ class Follower:
         n, state, goal = self._n, self._inputs.run.state, self._clipped(q)
         state[2 * n : 3 * n], state[3 * n] = goal, 0.0
         self._recovery.follow()
-        self._posture = goal
-        for inputs in self._inputs_by_kinds.values():
-            inputs.set_posture(goal)
+        self._is_at_rest, self.posture = False, goal
 
     def _clipped(self, q: ArrayLike) -> Array:
         return np.clip(self._plan.target_builder.start(q), *self._plan.bounds)
@@ -233,6 +339,8 @@ class Follower:
                 error: the motors stop, and `FollowState.reason` has the reason.
         """
         self._cycles += 1
+        if self._is_paused:
+            return self._finish(self._hold())
         poses, self._reason = self._poses(palm)
         if isinstance(target, Grasp):
             self._set_grasp(target, normals)
@@ -247,6 +355,9 @@ class Follower:
         if self._inputs.cycle.kinds != self._point_kinds:
             self._switch_kinds(self._point_kinds)
         self._tolerances = self._plan_tolerances
+        if self._clutch is not None:
+            q = self._posture_at_rest()
+            points, directions, poses = self._clutch.displaced(q, points, directions, poses)
         self._inputs.set_contacts(points, directions)
         state = self._step(poses, palm_weight)
         if not self._inputs.is_finite:
@@ -266,9 +377,14 @@ class Follower:
     def _step(self, palms: Poses, palm_weight: tuple[float, float]) -> Array:
         """Make a step towards the target; return the new state."""
         inputs = self._inputs
+        if self._is_beyond_limits:
+            self._return_to_limits()
         if palms:
             inputs.set_palms(palms, palm_weight)
-        step = self._recovery.step(inputs.run.state)
+        state = inputs.run.state
+        step = self._recovery.step(state)
+        if self._is_paused and self._is_at_rest:
+            step = braked(state[self._n : 2 * self._n], self._change)
         if self._guard is not None:
             state, self._is_stopped = self._guard.step(inputs, step)
         else:
@@ -301,7 +417,11 @@ class Follower:
         """Make a step in which the motors decelerate to rest; return the new state."""
         self._recovery.follow()
         self._inputs.clear_target()
-        self._set_goal_at_rest(self._inputs)
+        if self._is_paused:
+            # The motors track the goal, without free motions.
+            self._inputs.run.state[3 * self._n] = 0.0
+        else:
+            self._set_goal_at_rest(self._inputs)
         return self._step({}, (PALM_WEIGHT, PALM_WEIGHT))
 
     def _set_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
@@ -316,10 +436,29 @@ class Follower:
         if self._guard is not None:
             self._guard.set_target(problem)
 
+    def _return_to_limits(self) -> None:
+        """Set bounds that lead motors beyond their limits back to them."""
+        n, state = self._n, self._inputs.run.state
+        q, (lower, upper) = state[:n], self._plan.bounds
+        way = np.clip(q, lower, upper) - q
+        direction, distance = np.sign(way), np.abs(way)
+        change = CYCLE_TUNING.braking_share * self._change
+        step = np.maximum(direction * state[n : 2 * n], 0.0) + change
+        step = np.minimum(step, RETURN_SHARE * self.velocity * self.period)
+        q_next = q + direction * np.minimum(step, brake(distance, change))
+        for inputs in self._inputs_by_kinds.values():
+            inputs.set_bounds(np.minimum(lower, q_next), np.maximum(upper, q_next))
+        self._is_beyond_limits = bool(distance.any())
+
+    def _posture_at_rest(self) -> Array:
+        """Return the positions (n,) at which the motors can stop."""
+        n, state = self._n, self._inputs.run.state
+        return state[:n] + stopping_distance(state[n : 2 * n], self._change)
+
     def _set_goal_at_rest(self, inputs: FollowerInputs) -> None:
         """Set the goal to the positions at which the motors can stop."""
         n, state = self._n, inputs.run.state
-        state[2 * n : 3 * n] = state[:n] + stopping_distance(state[n : 2 * n], self._change)
+        state[2 * n : 3 * n] = self._posture_at_rest()
         state[3 * n] = 0.0
 
     def _vectors(self, name: str, value: ArrayLike) -> Array:

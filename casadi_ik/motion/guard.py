@@ -21,7 +21,7 @@ from casadi_ik.collision.clearance_kernel import OBSTACLES, Guarding
 from casadi_ik.collision.distances import levers
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
+from casadi_ik.motion.inputs import FollowerInputs, FollowPlan, clip_step
 
 
 def stopping_distance(step: Array, change: Array) -> Array:
@@ -33,6 +33,11 @@ def stopping_distance(step: Array, change: Array) -> Array:
     """
     cycles = np.floor(np.abs(step) / change)
     return np.sign(step) * (np.abs(step) * cycles - change * cycles * (cycles + 1) / 2)
+
+
+def braked(step: Array, change: Array) -> Array:
+    """Return the steps (n,) of braking motors after their last steps, see `stopping_distance`."""
+    return np.sign(step) * np.maximum(np.abs(step) - change, 0.0)
 
 
 def stopping_path(q: Array, step: Array, change: Array) -> Array:
@@ -164,7 +169,7 @@ class Guard:
         if not is_stopped.any():
             return new_state, False
         # Rounding errors of a motor that stops at a limit must not exceed it.
-        new_state[:n], new_state[n : 2 * n] = np.clip(q + step, *self._bounds), step
+        new_state[:n], new_state[n : 2 * n] = clip_step(q, step, self._bounds), step
         # Without this reset, the goal of a stopped motor could lie behind an obstacle.
         np.copyto(new_state[2 * n : 3 * n], q_rest, where=is_stopped)
         new_state[3 * n] = 0.0
@@ -188,10 +193,10 @@ class Guard:
             guarding.wanted_step[...] = requested_step
             guarding.stop_in_time()
             return guarding.share, guarding.step, guarding.q_rest
-        braked = np.sign(last_step) * np.maximum(np.abs(last_step) - self._change, 0.0)
+        braking_step = braked(last_step, self._change)
         fractions, attempts = np.array([*self.fractions, 0.0]), np.zeros(self._n, dtype=int)
         while True:
-            step = braked + fractions[attempts] * (requested_step - braked)
+            step = braking_step + fractions[attempts] * (requested_step - braking_step)
             path = stopping_path(q, step, self._change)
             initial, *distances = self._query.kernel.all_distances(
                 np.concatenate([q[None], path]), self._query.poses, self._query.table

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,7 @@ class FollowPlan:
         posture: (n,) posture to which free motions lead [rad or m].
         settling: Time constant of free motions [s]; infinite: no free motion.
         pull: Weight of the anchor, see `Cycle`.
+        nearest: Search for the configuration (n,) nearest to a target, given a start (n,).
     """
 
     target_builder: TargetBuilder
@@ -52,6 +53,7 @@ class FollowPlan:
     posture: Array
     settling: float
     pull: float
+    nearest: Callable[[TargetBatch, Array], Array]
 
     @property
     def robot(self) -> ArmHand:
@@ -205,6 +207,11 @@ class FollowerInputs:
 
     def errors(self, q: Array) -> tuple[Array, Array]:
         """Return the errors of a posture (n,) to the target: (f,) [m], (f,) [rad], NaN if free."""
+        position, angle, _ = deviations(self._robot, self.target(), q[None])
+        return position[0], angle[0]
+
+    def target(self) -> TargetBatch:
+        """Return the contacts of the present target, NaN where free."""
         weights = self.views["weights"]
 
         def target(name: str, is_set: Bools) -> Array:
@@ -216,11 +223,11 @@ class FollowerInputs:
         }
         points, normals = target("points", weights[:, 0] > 0), target("normals", weights[:, 1] > 0)
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-        problem = TargetBatch(
-            points, normals, Tolerance(), enforce_limits=True, extra_vectors=extra_vectors
+        limits = self.views["position_tolerance"].tolist(), self.views["angle_tolerance"].tolist()
+        tolerances = tuple(map(Tolerance, *limits))
+        return TargetBatch(
+            points, normals, tolerances, enforce_limits=True, extra_vectors=extra_vectors
         )
-        position, angle, _ = deviations(self._robot, problem, q[None])
-        return position[0], angle[0]
 
     @property
     def error_ratio(self) -> float:
@@ -258,11 +265,15 @@ class FollowerInputs:
             New state.
         """
         n, previous = len(step), self.run.state.copy()
-        q = np.clip(previous[:n] + step, *self._bounds)
+        q = clip_step(previous[:n], step, self._bounds)
         state = self.step_from_rest(q)
         state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n] = q, step, q, 0.0
         self.run.previous_state[:] = previous
         return state
+
+    def set_bounds(self, lower: Array, upper: Array) -> None:
+        """Set the bounds (n,) of the motors in the next cycle."""
+        self._fill(lower=lower, upper=upper)
 
     def set_posture(self, posture: Array) -> None:
         """Set the posture (n,) to which free motions lead."""
@@ -273,6 +284,17 @@ class FollowerInputs:
         self._mode = ""
         self._fill(points=0.0, normals=UNUSED_NORMAL, weights=0.0)
         self.clear_palms()
+
+
+def clip_step(q: Array, step: Array, bounds: tuple[Array, Array]) -> Array:
+    """Return positions (n,) after a step that rounding errors must not lead beyond the bounds.
+
+    Args:
+        q: (n,) positions before the step; they may be beyond the bounds.
+        step: (n,) step.
+        bounds: Lower and upper bounds, (n,) each.
+    """
+    return np.clip(q + step, np.minimum(bounds[0], q), np.maximum(bounds[1], q))
 
 
 def contact_weights(tolerances: tuple[Tolerance, ...]) -> Array:

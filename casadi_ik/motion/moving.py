@@ -98,6 +98,7 @@ class MovingSolver:
                 free_posture,
                 seconds("settling", settling),
                 FOLLOWING_PULL,
+                self._nearest,
             )
         )
 
@@ -458,8 +459,29 @@ class MovingSolver:
         bounds, rates = self._bounds(targets), unbounded(self.robot)
         check, compiled = self._engine.check, self._engine.compiled
         return FollowPlan(
-            self._target_builder, check, compiled, q0, bounds, 1.0, rates, q0, math.inf, PATH_PULL
+            self._target_builder,
+            check,
+            compiled,
+            q0,
+            bounds,
+            1.0,
+            rates,
+            q0,
+            math.inf,
+            PATH_PULL,
+            self._nearest,
         )
+
+    def _nearest(self, target: TargetBatch, q0: Array) -> Array:
+        """Return the configuration (n,) nearest to a target, and the one nearest to q0 of several.
+
+        Args:
+            target: One target.
+            q0: (n,) start of the search.
+        """
+        target = replace(target, q0=q0[None], prefer="q0")
+        options = SolveOptions(diagnose=False, best_effort=True)
+        return self._engine.engine_for(target).solve(target, options).q[0]
 
     def _bounds(self, targets: TargetBatch | None) -> tuple[Array, Array]:
         """Return the limits (n,) of motions, see `RobotDescription.motion_limits`."""

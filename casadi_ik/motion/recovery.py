@@ -15,11 +15,12 @@ motors, they increase the clearances, too, and choose a line again.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.motion.guard import Guard
+from casadi_ik.motion.guard import Guard, braked
 from casadi_ik.motion.inputs import FollowerInputs
 from casadi_ik.solve.verdict import TOLERANCE_SLACK
 
@@ -66,10 +67,10 @@ MAX_MET_RATIO = 1 + TOLERANCE_SLACK
 """Maximum error ratio at which the contacts are met."""
 
 
-def brake(distance: float, change: float) -> float:
+def brake(distance: Any, change: Any) -> Any:
     """Return the longest step from which a motion can stop within a distance, see `cycle.brake`."""
     u = distance / change
-    steps = math.floor((math.sqrt(1 + 8 * u) - 1) / 2)
+    steps = np.floor((np.sqrt(1 + 8 * u) - 1) / 2)
     return change * (u + steps * (steps + 1) / 2) / (steps + 1)
 
 
@@ -118,7 +119,7 @@ class Recovery:
             return None
         if not self._has_line:
             last_step = state[len(self._units) : 2 * len(self._units)]
-            return np.sign(last_step) * np.maximum(np.abs(last_step) - self._max_change, 0.0)
+            return braked(last_step, self._max_change)
         remaining = max(1.0 - self._done, 0.0)
         limit = min(self._line_fastest, self._line_step + self._line_change)
         self._next_step = min(limit, brake(remaining, self._line_change))

@@ -6,12 +6,14 @@ import math
 
 import numpy as np
 
+from casadi_ik.motion.guard import Guard
+from casadi_ik.motion.inputs import FollowerInputs
 from casadi_ik.motion.recovery import CAPACITY, CHECKS, Recovery
 
 PERIOD = 0.01
 
 
-class CountingGuard:
+class CountingGuard(Guard):
     """Guard of a robot of which only the recent postures are free; it counts the checks."""
 
     def __init__(self) -> None:
@@ -25,12 +27,20 @@ class CountingGuard:
         return q
 
 
-class CountingInputs:
+class CountingInputs(FollowerInputs):
     """Graph of a cycle that misses its target by the distance from 0; it counts evaluations."""
 
     def __init__(self) -> None:
         self.evaluated = 0
-        self.error_ratio = self.goal_error_ratio = math.inf
+        self.ratio = math.inf
+
+    @property
+    def error_ratio(self) -> float:
+        return self.ratio
+
+    @property
+    def goal_error_ratio(self) -> float:
+        return self.ratio
 
     def error_ratio_at(self, q: np.ndarray) -> float:
         self.evaluated += 1
@@ -45,11 +55,11 @@ def test_work_of_each_cycle_is_bounded():
     recovery = Recovery(units, 0.05 * units, 0.01 * units, PERIOD, guard)
     recovery.reset(np.zeros(2))
     state, total = np.zeros(6), 0
-    inputs.error_ratio = inputs.goal_error_ratio = 0.0
+    inputs.ratio = 0.0
     for _ in range(CAPACITY):
         state[:2] += 0.1
         recovery.update(inputs, state[:2], units, is_stopped=False)
-    inputs.error_ratio = inputs.goal_error_ratio = 20.0
+    inputs.ratio = 20.0
     for _ in range(400):
         guard.checked = inputs.evaluated = 0
         step = recovery.step(state)

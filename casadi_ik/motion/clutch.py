@@ -1,0 +1,75 @@
+"""Clutch of a follower: displacement from the targets of an operator to those of the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from casadi_ik.files.arrays import Array
+from casadi_ik.kinematics.arm_hand import ArmHand
+
+Poses = Mapping[str | None, Array]
+"""Poses of palms (4, 4) by side; the side is None for a single arm-hand."""
+
+
+def turn_between(a: Array, b: Array) -> Array:
+    """Return the smallest rotation (3, 3) that turns a unit vector a (3,) into b (3,)."""
+    cosine, (x, y, z) = a @ b, np.cross(a, b)
+    if cosine < -1 + 1e-12:
+        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+        axis /= np.linalg.norm(axis)
+        return np.array([[2.0 * x * y for x in axis] for y in axis]) - np.eye(3)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+class Clutch:
+    """Displacement of targets such that the first target after a pause does not move the robot.
+
+    Points are translated, normals and palms are rotated as well. Each finger and palm is anchored
+    when its first target arrives.
+    """
+
+    def __init__(self, robot: ArmHand) -> None:
+        """Start without anchored targets."""
+        self._robot = robot
+        self._offsets = np.full((len(robot.fingers), 3), np.nan)
+        self._turns = np.full((len(robot.fingers), 3, 3), np.nan)
+        self._palms = dict[str | None, tuple[Array, Array]]()
+
+    def displaced(
+        self, q: Array, points: Array, normals: Array | None, palms: Poses
+    ) -> tuple[Array, Array | None, Poses]:
+        """Return the targets of the robot for those of the operator.
+
+        Args:
+            q: (n,) posture to which new targets are anchored.
+            points: (f, 3) contact points [m].
+            normals: (f, 3) pad normals of any length, or None.
+            palms: Poses of palms.
+        """
+        directions = np.full_like(points, np.nan) if normals is None else normals
+        lengths = np.linalg.norm(directions, axis=1, keepdims=True)
+        is_new_point = np.isnan(self._offsets[:, 0]) & np.isfinite(points).all(axis=1)
+        is_new_normal = np.isnan(self._turns[:, 0, 0]) & np.isfinite(1 / lengths[:, 0])
+        if is_new_point.any() or is_new_normal.any():
+            tip_points, tip_normals = self._robot.contacts(q)
+            self._offsets[is_new_point] = (tip_points - points)[is_new_point]
+            for i in np.flatnonzero(is_new_normal):
+                self._turns[i] = turn_between(directions[i] / lengths[i], tip_normals[i])
+        displaced_palms = dict[str | None, Array]()
+        for side, pose in palms.items():
+            if side not in self._palms:
+                palm = self._robot.palm(q, side)
+                self._palms[side] = pose[:3, :3].T @ palm[:3, :3], palm[:3, 3] - pose[:3, 3]
+            turn, offset = self._palms[side]
+            displaced_palms[side] = pose.copy()
+            displaced_palms[side][:3, :3] = pose[:3, :3] @ turn
+            displaced_palms[side][:3, 3] += offset
+        points = np.where(np.isnan(self._offsets), points, points + self._offsets)
+        if normals is None:
+            return points, None, displaced_palms
+        turned = np.einsum("fij,fj->fi", self._turns, normals)
+        normals = np.where(np.isnan(self._turns[:, 0]), normals, turned)
+        return points, normals, displaced_palms
