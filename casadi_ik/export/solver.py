@@ -334,7 +334,7 @@ class SolverSources:
         rows = max(samples.count for _, samples in tables) + TILE
         # Distances of all rows and of their tiles are 32 bits each.
         work_size = rows if self.single is None else rows + rows // TILE
-        constants = define(lookup.constants | {"REGISTER_BYTES": 0})
+        constants = define(lookup.constants)
         kernels = (
             self._kernel_source(f"{name}look_up", "lookup", lookup.key, constants, work_size),
         )

@@ -1,7 +1,7 @@
 /* Lookup of the rows of a table with the nearest keys, in the order of their distance.
  *
- * Requires the macros N_IN, N_KEY, TILE, STEPS, LARGEST and REGISTER_BYTES (size of the machine's
- * vector registers; 0: unknown). The step graph computes a key.
+ * Requires the macros N_IN, N_KEY, TILE, STEPS and LARGEST, and outside of standalone solvers
+ * REGISTER_BYTES (size of the machine's vector registers; 0: unknown). The step graph computes a key.
  */
 #include <math.h>
 
@@ -68,25 +68,38 @@ UNROLLED void select_nearest(const lookup_job *job, int32_t *distance, int32_t *
   }
 }
 
-#if defined(__x86_64__) && REGISTER_BYTES
+/* PRODUCTS multiplies the 16-bit numbers of two vectors of REGISTER_BYTES bytes, and adds the products
+ * of each pair. Standalone solvers use the vectors that every machine of the architecture has. Inline
+ * assembly, since the header of the intrinsics takes longer to parse than this file takes to compile.
+ */
+#if defined(__x86_64__) && REGISTER_BYTES == 64
+#define TARGET __attribute__((target("avx512f,avx512bw")))
+#define PRODUCTS(sums, a, b) __asm__("vpmaddwd %2, %1, %0" : "=v"(sums) : "v"(a), "v"(b))
+#elif defined(__x86_64__) && REGISTER_BYTES
+#define TARGET __attribute__((target("avx2")))
+#define PRODUCTS(sums, a, b) __asm__("vpmaddwd %2, %1, %0" : "=x"(sums) : "x"(a), "x"(b))
+#elif defined(FREESTANDING) && defined(__GNUC__) && defined(__SSE2__)
+#define REGISTER_BYTES 16
+#define TARGET
+#define PRODUCTS(sums, a, b) \
+  sums = a; \
+  __asm__("pmaddwd %1, %0" : "+x"(sums) : "x"(b))
+#elif defined(FREESTANDING) && defined(__wasm_simd128__)
+#include <wasm_simd128.h>
+#define REGISTER_BYTES 16
+#define TARGET
+#define PRODUCTS(sums, a, b) sums = (wide) wasm_i32x4_dot_i16x8((v128_t) a, (v128_t) b)
+#endif
+
+#ifdef PRODUCTS
 #define PAIR_OF(numbers) \
   ((int32_t) ((uint32_t) (uint16_t) (numbers)[0] | (uint32_t) (uint16_t) (numbers)[1] << 16))
-
-/* Inline assembly, since the header of the intrinsics takes longer to parse than this file takes to
- * compile. */
-#if REGISTER_BYTES == 64
-#define TARGET "avx512f,avx512bw"
-#define REGISTER "v"
-#else
-#define TARGET "avx2"
-#define REGISTER "x"
-#endif
 
 typedef int32_t wide __attribute__((vector_size(REGISTER_BYTES)));
 typedef int16_t halves __attribute__((vector_size(REGISTER_BYTES)));
 
-LOOPS __attribute__((target(TARGET)))
-static void measure_wide(const lookup_job *job, const key_pair *pairs, int32_t *distance) {
+LOOPS TARGET static void measure_wide(const lookup_job *job, const key_pair *pairs,
+                                      int32_t *distance) {
   wide twice[PAIRS], mask[PAIRS];
   const int64_t parts = TILE * 4 / REGISTER_BYTES;
   int64_t part, count = (job->rows + TILE - 1) / TILE * parts;
@@ -100,76 +113,25 @@ static void measure_wide(const lookup_job *job, const key_pair *pairs, int32_t *
                      + (part / parts * PAIRS * parts + part % parts) * REGISTER_BYTES;
     wide sum = {0};
     for (i = 0; i < PAIRS; ++i) {
-      wide a, difference, both;
+      wide a, difference, products;
       memcpy(&a, from + i * parts * REGISTER_BYTES, REGISTER_BYTES);
       difference = (wide) ((halves) a - (halves) twice[i]) & mask[i];
-      __asm__("vpmaddwd %2, %1, %0" : "=" REGISTER(both) : REGISTER(a), REGISTER(difference));
-      sum += both;
+      PRODUCTS(products, a, difference);
+      sum += products;
     }
     memcpy(distance + part * (REGISTER_BYTES / 4), &sum, REGISTER_BYTES);
   }
 }
+#else
+#define TARGET
+#define measure_wide measure
+#endif
 
-LOOPS __attribute__((target(TARGET)))
-static void find(const lookup_job *job, const key_pair *pairs, int32_t *distance, int32_t *nearest,
-                 int64_t *nearest_rows) {
+LOOPS TARGET static void find(const lookup_job *job, const key_pair *pairs, int32_t *distance,
+                              int32_t *nearest, int64_t *nearest_rows) {
   measure_wide(job, pairs, distance);
   select_nearest(job, distance, nearest, nearest_rows);
 }
-#else
-#if defined(FREESTANDING) && (defined(__SSE2__) || defined(__wasm_simd128__))
-#if defined(__SSE2__)
-#include <emmintrin.h>
-typedef __m128i eight;
-#define LOADED(from) _mm_loadu_si128((const __m128i *) (const void *) (from))
-#define STORED(to, x) _mm_storeu_si128((__m128i *) (void *) (to), x)
-#define TWICE(x) _mm_set1_epi32(x)
-#define DIFFERENCE(a, twice, mask) _mm_and_si128(_mm_sub_epi16(a, twice), mask)
-#define SUM(sum, a, difference) _mm_add_epi32(sum, _mm_madd_epi16(a, difference))
-#else
-#include <wasm_simd128.h>
-typedef v128_t eight;
-#define LOADED(from) wasm_v128_load(from)
-#define STORED(to, x) wasm_v128_store(to, x)
-#define TWICE(x) wasm_i32x4_splat(x)
-#define DIFFERENCE(a, twice, mask) wasm_v128_and(wasm_i16x8_sub(a, twice), mask)
-#define SUM(sum, a, difference) wasm_i32x4_add(sum, wasm_i32x4_dot_i16x8(a, difference))
-#endif
-
-#define PAIR_OF(numbers) \
-  ((int32_t) ((uint32_t) (uint16_t) (numbers)[0] | (uint32_t) (uint16_t) (numbers)[1] << 16))
-
-/* Baseline vectors of 16 bytes, which every machine of the architecture has. */
-static void measure_eight(const lookup_job *job, const key_pair *pairs, int32_t *distance) {
-  eight twice[PAIRS], mask[PAIRS];
-  int64_t tile, tiles = (job->rows + TILE - 1) / TILE;
-  int i, part;
-  for (i = 0; i < PAIRS; ++i) {
-    twice[i] = TWICE(PAIR_OF(pairs[i].twice));
-    mask[i] = TWICE(PAIR_OF(pairs[i].mask));
-  }
-  for (tile = 0; tile < tiles; ++tile) {
-    const int16_t *row = job->tiles + tile * PAIRS * TILE * 2;
-    for (part = 0; part < TILE / 4; ++part) {
-      eight sum = TWICE(0);
-      for (i = 0; i < PAIRS; ++i) {
-        const eight a = LOADED(row + (i * TILE + part * 4) * 2);
-        sum = SUM(sum, a, DIFFERENCE(a, twice[i], mask[i]));
-      }
-      STORED(distance + tile * TILE + part * 4, sum);
-    }
-  }
-}
-
-#define measure measure_eight
-#endif
-
-LOOPS static void find(const lookup_job *job, const key_pair *pairs, int32_t *distance,
-                       int32_t *nearest, int64_t *nearest_rows) {
-  measure(job, pairs, distance);
-  select_nearest(job, distance, nearest, nearest_rows);
-}
-#endif
 
 DRIVER(lookup, lookup_job) {
   workspace space;
