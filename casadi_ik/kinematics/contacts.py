@@ -16,14 +16,16 @@ module.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate, pairwise
 from math import sqrt
 from typing import NamedTuple, TypeAlias
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import Field
 from casadi_ik.files.arrays import Array
@@ -508,3 +510,46 @@ def contact_errors(
         positions.append(position.measure(tip, target))
         angles.append(orientation.measure(tip, target))
     return ca.vertcat(*positions), ca.vertcat(*angles)
+
+
+def group_by_kinds(
+    targets: TargetBatch,
+) -> Iterator[tuple[Kinds, slice | NDArray[np.intp], TargetBatch]]:
+    """Group targets by the kinds of their contacts, one group per kernel.
+
+    The kinds of a target do not depend on the batch. If a finger has a tangent, all fingers get a
+    free tangent, and if a finger has a ball, fingers without a point get a ball: a kernel for every
+    combination would not be faster.
+
+    Yields:
+        Kinds, rows (a full slice if there is one group) and the targets in these rows.
+    """
+    f = targets.points.shape[1]
+    if not targets.extra_vectors:
+        yield point_normal_kinds(f), slice(None), targets
+        return
+    names = list(targets.extra_vectors)
+    has_vector = np.stack(
+        [~np.isnan(targets.extra_vectors[name][..., 0]) for name in names], axis=2
+    )
+    if "tangents" in names:
+        has_tangent = has_vector[..., names.index("tangents")]
+        has_tangent[:] = has_tangent.any(axis=1, keepdims=True)
+    if "balls" in names:
+        has_ball = has_vector[..., names.index("balls")]
+        has_ball |= has_ball.any(axis=1, keepdims=True) & np.isnan(targets.points[..., 0])
+    flags = has_vector.reshape(len(has_vector), -1)
+    _, first_rows, group = np.unique(
+        flags @ (1 << np.arange(flags.shape[1])), return_index=True, return_inverse=True
+    )
+    for i, finger_flags in enumerate(has_vector[first_rows].tolist()):
+        kinds = tuple(
+            kind_from_vectors(name[:-1] for name, flag in zip(names, row, strict=True) if flag)
+            for row in finger_flags
+        )
+        if len(first_rows) == 1:
+            yield kinds, slice(None), targets
+            return
+        rows = np.flatnonzero(group == i)
+        row_numbers = np.array([targets.row_number(row) for row in rows.tolist()])
+        yield kinds, rows, replace(targets.rows(rows), row_numbers=row_numbers)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.renamed_modules import warn_renamed
-from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import Event
 from casadi_ik.logs.format import LogClock
 from casadi_ik.logs.reader import Log
@@ -28,6 +27,7 @@ from casadi_ik.logs.wording import (
     joined_names,
     plain_name,
 )
+from casadi_ik.model.targets import EXTRA_ARRAY_NAMES
 from casadi_ik.solve.trace import CLEARANCE
 
 MAX_PHASE_SPANS = 6

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import Field, Layout, opaque
-from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import EventKind
 from casadi_ik.logs.traces import as_matrix, jacobian_names, measured_jacobians, words_of
-from casadi_ik.model.targets import NO_PREFERENCE, PREFERENCES
+from casadi_ik.model.targets import EXTRA_ARRAY_NAMES, NO_PREFERENCE, PREFERENCES
 from casadi_ik.solve.recorder import SolveBlock
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.trace import CLEARANCE, TraceFormat

@@ -17,13 +17,12 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
 from casadi_ik.logs.events import Event
 from casadi_ik.logs.reader import Log
 from casadi_ik.logs.tables import MethodRows, Table, element_name, events_of, label_of
 from casadi_ik.logs.traces import bits_of, measured_jacobians
 from casadi_ik.logs.wording import errors_text
-from casadi_ik.model.targets import NO_PREFERENCE, Tolerance
+from casadi_ik.model.targets import EXTRA_ARRAY_NAMES, NO_PREFERENCE, Tolerance
 from casadi_ik.solve.trace import SIGMA, TraceFormat
 
 

@@ -12,7 +12,18 @@ from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.model.description import RobotDescription
-from casadi_ik.model.grasp import Tolerance, real_array, unit_vectors
+from casadi_ik.model.grasp import (
+    EXTRA_VECTORS,
+    Tolerance,
+    invalid_mask,
+    invalid_reason,
+    orthogonal_tangents,
+    real_array,
+    unit_vectors,
+)
+
+EXTRA_ARRAY_NAMES = tuple(f"{name}s" for name in EXTRA_VECTORS)
+"""Names of the arrays of extra target vectors."""
 
 LIMIT_MODES = ("enforce", "ignore")
 """Treatment of joint limits. "enforce": a solution is within them; "ignore": they do not matter, as
@@ -338,3 +349,74 @@ def _refuse(invalid: NDArray[np.bool_], first_row: int, name: str, problem: str)
     if len(indices):
         row, finger = first_row + int(indices[0, 0]), indices[0, 1]
         raise RowError(f"{name}: row {row}, finger {finger} {problem}", row)
+
+
+def check_extra_vectors(
+    extra_vectors: Mapping[str, ArrayLike | None], points: Array, normals: Array, first_row: int = 0
+) -> dict[str, Array]:
+    """Validate the extra vectors of a batch.
+
+    Args:
+        extra_vectors: (k, f, 3) by name; NaN where free, None if absent.
+        points: (k, f, 3) checked [m].
+        normals: (k, f, 3) checked, unit.
+        first_row: Index of the first row, for messages.
+
+    Returns:
+        Unit vectors (k, f, 3) by name, without arrays that are NaN everywhere.
+
+    Raises:
+        UnknownNameError: The name of an array is unknown.
+        RowError: A vector is partly NaN, infinite, zero or inconsistent with other vectors of the
+            contact; the message names row and finger.
+        InputError: An array has a wrong shape or is not numeric.
+    """
+    arrays: dict[str, Array] = {}
+    for name, value in extra_vectors.items():
+        if name not in EXTRA_ARRAY_NAMES:
+            expected = ", ".join((*EXTRA_ARRAY_NAMES, DIRECTIONS_KEY))
+            raise UnknownNameError(f"{name!r} does not exist; expected one of {expected}")
+        if value is None:
+            continue
+        try:
+            array = np.array(value, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name}: expected an array of numbers") from error
+        if array.shape != points.shape:
+            raise InputError(f"{name}: found shape {array.shape}, expected {points.shape}")
+        if not np.isnan(array).all():
+            arrays[name] = array
+    if not arrays:
+        return arrays
+    is_invalid, units = np.zeros(points.shape[:2], dtype=bool), dict[str, Array]()
+    for name, array in arrays.items():
+        is_constrained = ~np.isnan(array).all(axis=2)
+        with np.errstate(invalid="ignore"):
+            units[name], zero = unit_vectors(array)
+        is_invalid |= is_constrained & (zero | ~np.isfinite(array).all(axis=2))
+    vectors = {name[:-1]: array for name, array in units.items()}
+    is_invalid |= invalid_mask({"point": points, "normal": normals, **vectors})
+    for row, finger in np.argwhere(is_invalid)[:1].tolist():
+        all_arrays = {"points": points, "normals": normals, **arrays}
+        problem = _describe_problem(
+            {name: array[row, finger] for name, array in all_arrays.items()}
+        )
+        raise RowError(f"row {first_row + row}, finger {finger}: {problem}", first_row + row)
+    if "tangents" in units:
+        units["tangents"] = orthogonal_tangents(units["tangents"], normals)
+    return units
+
+
+def _describe_problem(vectors: Mapping[str, Array]) -> str:
+    """Return the problem of an invalid contact."""
+    units: dict[str, Array] = {}
+    for name, vector in vectors.items():
+        if np.isnan(vector).all():
+            continue
+        if not np.isfinite(vector).all():
+            return f"{name[:-1]}: found {vector.tolist()}, expected finite numbers, or all NaN"
+        unit, zero = unit_vectors(vector)
+        if name in EXTRA_ARRAY_NAMES and zero:
+            return f"{name[:-1]}: found {vector.tolist()}, expected a direction, not zero"
+        units[name[:-1]] = unit if name in EXTRA_ARRAY_NAMES else vector
+    return invalid_reason(units) or "malformed"

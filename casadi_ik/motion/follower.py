@@ -14,8 +14,7 @@ from casadi_ik.errors import InputError, InvalidPoseError
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import single_pose
-from casadi_ik.kinematics.contact_batches import group_by_kinds
-from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds
+from casadi_ik.kinematics.contacts import Kinds, group_by_kinds, point_normal_kinds
 from casadi_ik.model.grasp import Grasp, real_array
 from casadi_ik.motion.clutch import Clutch, Poses
 from casadi_ik.motion.cycle import CYCLE_TUNING

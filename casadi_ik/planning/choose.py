@@ -19,7 +19,7 @@ from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contact_batches import group_by_kinds
+from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse, transform_arrays
 from casadi_ik.model.targets import CLEARANCE, TargetBatch

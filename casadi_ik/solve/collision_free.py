@@ -10,7 +10,7 @@ import numpy as np
 
 from casadi_ik.collision.clearance import Clearances, CollisionQuery
 from casadi_ik.files.arrays import Array
-from casadi_ik.kinematics.contact_batches import group_by_kinds
+from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.targets import CLEARANCE, MANIPULABILITY, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
 from casadi_ik.solve.batches import judge_outcome

@@ -18,8 +18,7 @@ from casadi_ik.errors import InputError, RowError, UnsupportedError
 from casadi_ik.files.progress import is_interactive, progress
 from casadi_ik.files.writing import BackgroundWriter
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contact_batches import group_by_kinds
-from casadi_ik.kinematics.contacts import Kinds, point_normal_kinds
+from casadi_ik.kinematics.contacts import Kinds, group_by_kinds, point_normal_kinds
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import MANIPULABILITY, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder

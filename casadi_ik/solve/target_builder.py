@@ -19,7 +19,6 @@ from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.numbers import warn_of_far_contacts, warn_of_wide_tolerance
 from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contact_batches import check_extra_vectors
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.model.pose import Free
@@ -30,6 +29,7 @@ from casadi_ik.model.targets import (
     PREFERENCES,
     Q0,
     TargetBatch,
+    check_extra_vectors,
     fixed_array,
     target_arrays,
 )

@@ -18,8 +18,7 @@ from casadi_ik.errors import InputError, UnsupportedError, os_errors
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import RAISE_HINT, scaled_limit
 from casadi_ik.files.number_files import READ_ERRORS
-from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
-from casadi_ik.model.targets import DIRECTIONS_KEY
+from casadi_ik.model.targets import DIRECTIONS_KEY, EXTRA_ARRAY_NAMES
 
 if TYPE_CHECKING:
     import polars

@@ -43,11 +43,10 @@ from casadi_ik.integrations.datasets.postures import (
 )
 from casadi_ik.integrations.datasets.tables import TABLE_SUFFIXES, read_table
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
-from casadi_ik.kinematics.contact_batches import EXTRA_ARRAY_NAMES
 from casadi_ik.model.grasp import Contact, Grasp
 from casadi_ik.model.load_grasp import load_grasp_files
 from casadi_ik.model.objects import GraspObject, is_mesh_name, load_object
-from casadi_ik.model.targets import DIRECTIONS_KEY
+from casadi_ik.model.targets import DIRECTIONS_KEY, EXTRA_ARRAY_NAMES
 from casadi_ik.solve.target_files import TargetFile
 
 Invalid = Literal["error", "drop", "clip"]
