@@ -131,3 +131,26 @@ def test_representations_are_short(results: dict[str, Any], kind: str) -> None:
     text = repr(results[kind])
     assert text.count("\n") < 25
     assert len(text) < 2000
+
+
+@pytest.mark.parametrize("method", ["hand-first", "ipopt", "enhanced-dls"])
+@pytest.mark.parametrize("copied", ["pickle", "deepcopy"])
+def test_copies_of_solvers_give_the_same_solution(
+    robot: ik.ArmHand, method: str, copied: str
+) -> None:
+    grasp, solver = (
+        ik.load_grasp("cup"),
+        ik.Solver(robot, method, {"thumb": ik.Tolerance(1e-3, 0.01)}),
+    )
+    solver_copy, grasp_copy = COPIES[copied](solver), COPIES[copied](grasp)
+    assert solver_copy.tolerances == solver.tolerances
+    np.testing.assert_array_equal(solver_copy.solve(grasp_copy).q, solver.solve(grasp).q)
+
+
+def test_solvers_in_other_processes_give_the_same_solution(robot: ik.ArmHand) -> None:
+    joblib = pytest.importorskip("joblib")
+    grasp, solver = ik.load_grasp("cup"), ik.Solver(robot)
+    with joblib.parallel_config(backend="loky"):
+        solutions = joblib.Parallel(n_jobs=2)(joblib.delayed(solver.solve)(grasp) for _ in range(2))
+    for solution in solutions:
+        np.testing.assert_array_equal(solution.q, solver.solve(grasp).q)

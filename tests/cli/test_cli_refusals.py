@@ -44,8 +44,6 @@ BYTES = {
     "hand_only.yaml": b"{name: hand_only, hand: barrett_bh8_280, thumb: thumb, fingers: [thumb, "
     b"finger_2, finger_3]}",
     "toe.csv": b"finger,index_proximal_slider,index_middle_slider,x,y,z\ntoe,0.05,0.05,0,0,0\n",
-    "short.csv": b"finger,index_proximal_slider,index_middle_slider,x,y,z\nindex,0.05,0,0,0\n",
-    "none.csv": b"finger,index_proximal_slider,index_middle_slider,x,y,z\n",
 }
 ARRAYS: dict[str, Callable[[Any, Any], dict[str, Any]]] = {
     "targets": lambda p, n: {"points": p, "normals": n},
@@ -162,9 +160,6 @@ reach cup --rank 2 --out w.npz => --rank
 reach cup --direction 1 --out w.npz => --direction 1 3
 reach cup --direction 0 0 0 --out w.npz => --direction
 
-calibrate none.csv --robot ar10 --out c.yaml => none.csv
-calibrate toe.csv --robot ar10 --out c.yaml => toe.csv:2 finger 'toe'
-calibrate short.csv --robot ar10 --out c.yaml => short.csv:2 5 6
 calibrate no.csv --robot ar10 --out c.yaml => no.csv
 calibrate toe.csv --robot ar10 --loss median --out c.yaml => --loss 'median'
 calibrate toe.csv --robot ar10 --estimate screws --out c.yaml => --estimate 'screws'
@@ -172,6 +167,12 @@ calibrate toe.csv --robot ar10 --out c.json => 'c.json'
 
 view cup --port 99999 => --port '99999' 1 65535
 view cpu => 'cpu' 'cup'
+view cup mug => 2 names
+view cup --method x => --method 'x'
+view cup --pads => --pads
+view cup --host 192.0.2.1 => host '192.0.2.1'
+view no.mcap => no.mcap
+view no.json => no.json
 log info => FILE
 log info no.mcap => no.mcap
 log info empty => empty

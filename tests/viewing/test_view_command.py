@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -131,28 +130,6 @@ def test_motions_play(view, robot: ik.ArmHand, tmp_path: Path) -> None:
     assert np.allclose(drawn_view.q, q[24])
     assert "1.20</b> of 2.00 s" in page._summary.content
     assert "lwr_joint_3" in page._charts.content
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["cupp"], "'cupp'"),
-        (["cup", "mug"], "2 names"),
-        (["cup", "--method", "x"], "--method: .*'x'"),
-        (["cup", "--pads"], "--pads: "),
-        (["nothing.mcap"], "nothing.mcap: "),
-        (["nothing.json"], "nothing.json: "),
-        (["cup", "--host", "192.0.2.1"], "host: .*'192.0.2.1'"),
-        (["cup", "--port", "99999"], "--port: .*'99999'"),
-    ],
-)
-def test_bad_options_are_refused(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["view", *words]) == 2
-    error_text = capsys.readouterr().err
-    assert re.search(message, error_text)
-    assert error_text.count("\n") == 1
 
 
 def test_robot_and_solution_open_viewers(robot: ik.ArmHand) -> None:
