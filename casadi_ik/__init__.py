@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from casadi_ik.model.load_grasp import load_grasp, shipped_grasps
     from casadi_ik.model.pose import Free
     from casadi_ik.planning.touch.surface import Surface, load_surface
+    from casadi_ik.solve.best_effort import BestEffort
     from casadi_ik.solve.registry import register_method
     from casadi_ik.solve.solution import BatchSolution, Solution
     from casadi_ik.solve.status import Status
@@ -27,6 +28,7 @@ _MODULES = {
     "METHODS": "api",
     "ArmHand": "kinematics.arm_hand",
     "BatchSolution": "solve.solution",
+    "BestEffort": "solve.best_effort",
     "Candidates": "integrations.datasets",
     "CasadiIKError": "errors",
     "Contact": "model.grasp",
@@ -58,6 +60,7 @@ __all__ = [
     "METHODS",
     "ArmHand",
     "BatchSolution",
+    "BestEffort",
     "Candidates",
     "CasadiIKError",
     "Contact",

@@ -30,6 +30,7 @@ from casadi_ik.planning.reach.place_base import place_base
 from casadi_ik.planning.reach.reach_map import reach_map
 from casadi_ik.planning.touch.grasps import grasps_of
 from casadi_ik.solve.alternatives import DEFAULT_SEPARATION
+from casadi_ik.solve.best_effort import BestEffort
 from casadi_ik.solve.engine import Engine, SolvedBlock, SolveOptions
 from casadi_ik.solve.fast import FastSolver
 from casadi_ik.solve.hand_postures import broadcast_postures
@@ -176,7 +177,7 @@ class Solver(MovingSolver):
         diagnose: bool = True,
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
-        best_effort: bool | str = False,
+        best_effort: bool | str | BestEffort = False,
     ) -> Solution:
         """Solve one grasp.
 
@@ -194,7 +195,8 @@ class Solver(MovingSolver):
             best_effort: Whether to return the nearest configuration found of a grasp that is not
                 solved, with status NEAREST: the sum of its squared contact errors, each divided by
                 its tolerance, is least. "local": the local minimum that is reached from q0, so that
-                a robot that follows a moving target does not jump.
+                a robot that follows a moving target does not jump. `BestEffort`: with weights, or
+                the least largest error.
 
         Returns:
             The solution; failure to converge is a status, never an exception.
@@ -248,7 +250,7 @@ class Solver(MovingSolver):
         compression: Compression = "zstd",
         prefer: str | None = None,
         object_pose: ArrayLike | None = None,
-        best_effort: bool | str = False,
+        best_effort: bool | str | BestEffort = False,
         **more: ArrayLike | None,
     ) -> BatchSolution:
         """Solve k targets.
@@ -308,7 +310,7 @@ class Solver(MovingSolver):
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
         first_row: int = 0,
-        best_effort: bool | str = False,
+        best_effort: bool | str | BestEffort = False,
     ) -> Generator[SolvedBlock, None, None]:
         """Solve a stream of targets block by block, in the memory of one block.
 
@@ -443,7 +445,7 @@ class Solver(MovingSolver):
         diagnose: bool = False,
         fixed: Mapping[str, float] | None = None,
         prefer: str | None = None,
-        best_effort: bool | str = False,
+        best_effort: bool | str | BestEffort = False,
     ) -> BatchSolution:
         """Solve k palm poses with known hand postures: only the arm is unknown.
 

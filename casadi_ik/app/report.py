@@ -447,8 +447,9 @@ def ranking_report(
     """
     candidates_text = f"{ranking.candidates} candidates" + (f" of {source}" if source else "")
     summary = f"{ranking.answered} of {candidates_text} have an answer"
-    status = "FOUND" if ranking.entries else "NONE FOUND"
-    parts: list[RenderableType] = [headline(bool(ranking.entries), status, summary)]
+    nearest = "NEAREST" if ranking.entries else "NONE FOUND"
+    status = "FOUND" if ranking.answered else nearest
+    parts: list[RenderableType] = [headline(ranking.answered > 0, status, summary)]
     if ranking.entries:
         seconds = ranking.entries[0].solution.time * ranking.candidates
         best = table("candidate", "name", "score", "clearance", right=("score",))

@@ -31,8 +31,9 @@ from casadi_ik.solve.alternatives import (
 )
 from casadi_ik.solve.arm_search import Preference
 from casadi_ik.solve.batches import judge_outcome
+from casadi_ik.solve.best_effort import BestEffort
 from casadi_ik.solve.collision_free import find_collision_free
-from casadi_ik.solve.engine import Engine
+from casadi_ik.solve.engine import Engine, SolveOptions
 from casadi_ik.solve.method import Outcome
 from casadi_ik.solve.row_selection import Deduplicator, largest_per_owner
 from casadi_ik.solve.solution import Choice, Ranking, Solution
@@ -121,6 +122,7 @@ def choose(
     fixed: Mapping[str, float] | None = None,
     apart: float = DEFAULT_SEPARATION,
     per_candidate: int | None = 1,
+    best_effort: bool | BestEffort = False,
 ) -> Ranking:
     """Rank candidate grasps and return the best feasible solutions.
 
@@ -145,6 +147,9 @@ def choose(
             of its range, 0 to 1. 0: solutions must not be equal.
         per_candidate: Maximum number of solutions per candidate. None: unlimited; the search ends
             after `limit` solutions.
+        best_effort: Whether to return nearest configurations, see `solve`, if no candidate has a
+            solution; they are ranked by `Solution.error_ratio`, the least first, and the ranking's
+            `prefer` is "nearest".
 
     Returns:
         The solutions, best first, and the number of unsolved candidates by reason.
@@ -183,15 +188,19 @@ def choose(
         parts += search.solve(~solutions.is_solved, thorough=True)
         solutions = CandidateSolutions.concatenate(parts, len(grasps))
         best = search.best(solutions, apart, max_per_candidate)
+    ranked = [
+        (int(solutions.candidate[row]), solution, float(solutions.score[row]))
+        for row, solution in best
+    ]
+    if best_effort and not ranked:
+        ranked, name = search.nearest(best_effort), "nearest"
     seconds = (time.perf_counter() - begin) / len(grasps)
     entries = []
-    for row, solution in best:
-        candidate = int(solutions.candidate[row])
+    for candidate, solution, score in ranked:
         grasp = grasps[candidate]
         if pose is not None:
             grasp = grasp.in_object_frame().at(pose)
-        timed = replace(solution, time=seconds)
-        entries.append(Choice(candidate, timed, float(solutions.score[row]), grasp))
+        entries.append(Choice(candidate, replace(solution, time=seconds), score, grasp))
     reasons = [reason for reason in solutions.reasons.tolist() if reason]
     return Ranking(
         entries=tuple(entries),
@@ -385,6 +394,20 @@ class _Search:
             if not failed:
                 return [(row, verified[row]) for row in best_rows]
             order = order[~np.isin(order, failed)]
+
+    def nearest(self, best_effort: bool | BestEffort) -> list[tuple[int, Solution, float]]:
+        """Return the candidates with the least error ratios, their nearest solutions and scores.
+
+        The score is the negative error ratio.
+        """
+        nearest = []
+        for indices, targets in self.groups:
+            group = targets.starting_at(self.start)
+            batch = self.engine.solve(group, SolveOptions(best_effort=best_effort))
+            rows = np.flatnonzero(batch.status == Status.NEAREST).tolist()
+            ratios = batch.error_ratio
+            nearest += [(int(indices[i]), batch.solution(i), -float(ratios[i])) for i in rows]
+        return sorted(nearest, key=lambda entry: (-entry[2], entry[0]))[: self.limit]
 
     def _verify(self, solutions: CandidateSolutions, rows: NDArray[np.intp]) -> dict[int, Solution]:
         """Return the checked solutions by row."""

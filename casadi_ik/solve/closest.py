@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,6 @@ from casadi_ik.solve.hand_first.rows import fit_hands_again
 from casadi_ik.solve.row_selection import smallest_per_owner
 from casadi_ik.solve.subproblems import (
     UNREACHABLE_TOLERANCE,
-    LocalRefinement,
     SubproblemSolver,
     residual_tolerances,
 )
@@ -84,8 +84,29 @@ class ClosestConfigurations:
         self.factor[rows] = closer.factor
 
 
+class WeightedRefinement(Protocol):
+    """Refinement of configurations under changing weights."""
+
+    @property
+    def targets(self) -> TargetBatch:
+        """The targets."""
+        ...
+
+    def run(self, owner: Rows, q: Array, *, weights: Array) -> Array:
+        """Return refined configurations (m, n), see `LocalRefinement.run`."""
+        ...
+
+    def misses(self, owner: Rows, q: Array) -> Array:
+        """Return (m, f, 2) residual norms, see `LocalRefinement.misses`."""
+        ...
+
+
 def find_closest(
-    refinement: LocalRefinement, owner: Rows, q: Array, max_starts: int
+    refinement: WeightedRefinement,
+    owner: Rows,
+    q: Array,
+    max_starts: int,
+    tolerances: Array | None = None,
 ) -> ClosestConfigurations:
     """Refine the best of some configurations to their minimax minimum.
 
@@ -94,13 +115,17 @@ def find_closest(
         owner: (m,) target index of each configuration; every target has at least one.
         q: (m, n) start configurations [rad or m].
         max_starts: Maximum number of configurations per target that are refined.
+        tolerances: (k, f, 2) residuals by which errors are divided, 0 where free; None: those at
+            tolerance.
     """
     settings = CLOSEST_SETTINGS
     cost = (refinement.misses(owner, q) ** 2).sum(axis=(1, 2))
     selected = smallest_per_owner(owner, cost, max_starts)
     owner, q = owner[selected], q[selected]
     count, first = len(q), np.searchsorted(owner, np.arange(len(refinement.targets)))
-    tolerance = residual_tolerances(refinement.targets)[owner]
+    if tolerances is None:
+        tolerances = residual_tolerances(refinement.targets)
+    tolerance = tolerances[owner]
     is_constrained = tolerance > 0
     total = (tolerance**2).sum(axis=(1, 2))
     weights = is_constrained.astype(float)

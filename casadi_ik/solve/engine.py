@@ -23,6 +23,7 @@ from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import MANIPULABILITY, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
 from casadi_ik.solve.batches import BatchParts, SolvedPart, judge_outcome, map_ordered
+from casadi_ik.solve.best_effort import BestEffort
 from casadi_ik.solve.collision_free import RANKING_PREFERENCES, resolve_collisions, resolve_single
 from casadi_ik.solve.diagnosis import Diagnosis, Reason
 from casadi_ik.solve.diagnostician import Diagnostician
@@ -40,9 +41,6 @@ from casadi_ik.solve.subproblems import SubproblemSolver
 from casadi_ik.solve.turns import in_nearest_turns, with_search_starts
 from casadi_ik.solve.verdict import contact_verdicts
 
-LOCAL = "local"
-"""Best effort that stays near the start."""
-
 
 @dataclass(slots=True, eq=False)
 class SolveOptions:
@@ -52,8 +50,8 @@ class SolveOptions:
         jobs: Number of threads, at least 1; compiled loops run concurrently.
         recorder: Recorder of the iterations; None: they are not recorded.
         diagnose: Whether to diagnose targets that are not solved.
-        best_effort: Whether to return the nearest configuration of targets that are not solved;
-            `LOCAL` for the local minimum that is reached from the start.
+        best_effort: Whether to return the nearest configuration of targets that are not solved, or
+            its options, see `BestEffort.of`.
         show_progress: Whether to show a progress bar on an interactive terminal.
     """
 
@@ -61,16 +59,22 @@ class SolveOptions:
     recorder: Recorder | None = None
     diagnose: bool = False
     show_progress: bool = False
-    best_effort: bool | str = False
+    best_effort: bool | str | BestEffort = False
 
     def __post_init__(self) -> None:
-        if self.best_effort not in (False, True, LOCAL):
-            raise InputError(
-                f"best_effort: found {self.best_effort!r}, expected True, False or {LOCAL!r}"
-            )
+        BestEffort.of(self.best_effort)
         if not isinstance(self.jobs, (int, np.integer)) or self.jobs < 1:
             raise InputError(f"jobs: found {self.jobs!r}, expected an integer >= 1")
         self.jobs = int(self.jobs)
+
+    def check(self, robot: ArmHand) -> None:
+        """Check that the options fit a robot.
+
+        Raises:
+            UnknownNameError: The robot does not have a finger with weights.
+        """
+        if (best_effort := BestEffort.of(self.best_effort)) is not None:
+            best_effort.check(robot.fingers)
 
 
 REQUIRED_ARRAYS = ("points", "normals")
@@ -225,7 +229,9 @@ class Engine:
 
         Raises:
             InputError: The method does not support the target.
+            UnknownNameError: See `SolveOptions.check`.
         """
+        options.check(self.robot)
         if targets.extra_vectors and (engine := self.engine_for(targets)) is not self:
             return engine.solve_one(targets, options)
         method, outcome = self.hand_search, None
@@ -300,7 +306,9 @@ class Engine:
 
         Raises:
             InputError: The method does not support the targets.
+            UnknownNameError: See `SolveOptions.check`.
         """
+        options.check(self.robot)
         if targets.palms is not None:
             _ = self._prepared_hand_search  # no other method keeps the hand of each target
         recorder = options.recorder
@@ -425,9 +433,8 @@ class Engine:
                         part,
                         batch,
                     )
-            if options.best_effort:
-                is_local = options.best_effort == LOCAL
-                batch = self._replace_by_nearest(near, outcome, batch, query, is_local)
+            if (best_effort := BestEffort.of(options.best_effort)) is not None:
+                batch = self._replace_by_nearest(near, outcome, batch, query, best_effort)
             q = in_nearest_turns(self.robot.description, part, batch.q)
             batch = replace(batch, q=q)
             parts.adapt_to_time(1e-9 * (time.time_ns() - started))
@@ -441,7 +448,7 @@ class Engine:
         outcome: Outcome,
         batch: BatchSolution,
         query: CollisionQuery | None,
-        is_local: bool,
+        best_effort: BestEffort,
     ) -> BatchSolution:
         """Replace the configurations of unsolved targets by the nearest ones.
 
@@ -454,11 +461,8 @@ class Engine:
         q, seconds = batch.q.copy(), batch.time.copy()
         for engine, members, group in self.group_by_contact_kind(targets.rows(rows)):
             members, search = rows[members], engine.nearest_search
-            if is_local:
-                q[members] = search.descend(group)
-            else:
-                group_query = None if query is None else query.rows(members)
-                q[members] = search.find(group, q[members], group_query)
+            group_query = None if query is None else query.rows(members)
+            q[members] = search.solve(group, q[members], group_query, best_effort)
         if query is not None:
             rows = rows[query.rows(rows).check(q[rows]).free]
             q = np.where(np.isin(np.arange(len(q)), rows)[:, None], q, batch.q)

@@ -25,13 +25,16 @@ from casadi_ik.compile.graphs import recipe
 from casadi_ik.compile.libraries import load_library
 from casadi_ik.compile.loop import MIN_SOLVES_IN_LANES, NO_LIMIT, SLOTS, UNBEGUN, Job, LoopKernel
 from casadi_ik.files.arrays import Array, Rows, spread_points
+from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.best_effort import BestEffort
+from casadi_ik.solve.closest import find_closest
 from casadi_ik.solve.hand_first.search_code import EXPORT
 from casadi_ik.solve.nearest_descent import DESCENT, DescentStep
 from casadi_ik.solve.nearest_seeds import SEED_SETTINGS, SeedSettings, SeedTable
 from casadi_ik.solve.row_selection import smallest_per_owner
-from casadi_ik.solve.subproblems import LocalRefinement, SubproblemSolver, residual_tolerances
+from casadi_ik.solve.subproblems import SubproblemSolver, residual_norms, residual_tolerances
 
 
 @dataclass(frozen=True)
@@ -225,11 +228,30 @@ class NearestSearch:
         """The compiled search; None without compiled code."""
         return _load_search() if self._kernel.compiled else None
 
+    def solve(
+        self,
+        targets: TargetBatch,
+        last_q: Array,
+        query: CollisionQuery | None,
+        options: BestEffort,
+    ) -> Array:
+        """Return nearest configurations (k, n) as options require, see `find` [rad or m]."""
+        tolerances = options.tolerances(targets, self._trials.robot.fingers)
+        if options.local:
+            q = self.descend(targets, tolerances=tolerances)
+        else:
+            q = self.find(targets, last_q, query, tolerances)
+        if not options.minimax:
+            return q
+        descents = WeightedDescents(self, targets)
+        return find_closest(descents, np.arange(len(q)), q, 1, tolerances).minimax_q
+
     def find(
         self,
         targets: TargetBatch,
         last_q: Array,
         query: CollisionQuery | None = None,
+        tolerances: Array | None = None,
     ) -> Array:
         """Return the nearest configurations found (k, n) [rad or m].
 
@@ -239,9 +261,11 @@ class NearestSearch:
             last_q: (k, n) configurations at which the solves ended; NaN: none [rad or m].
             query: Collision query of the targets; None: collisions are not checked. If none of a
                 target's minima is free of collisions, the nearest one is returned.
+            tolerances: (k, f, 2) residuals by which errors are divided, 0 where free; None: those
+                at tolerance.
         """
         q0 = np.ascontiguousarray(targets.starts(self._trials.robot.description))
-        parameters = self._parameters(targets, UNLIMITED_STEP)
+        parameters = self.parameters(targets, UNLIMITED_STEP, tolerances)
         if self._entry is None:
             return self._find_without_compiler(parameters, q0, last_q, query)
         last_q = np.ascontiguousarray(last_q)
@@ -307,25 +331,46 @@ class NearestSearch:
             distances = self._free_distances(query.rows(owner), states)
         return self._q(states)[smallest_per_owner(owner, distances, 1)]
 
-    def descend(self, targets: TargetBatch, is_local: bool = True) -> Array:
+    def descend(
+        self, targets: TargetBatch, is_local: bool = True, tolerances: Array | None = None
+    ) -> Array:
         """Return the local minima (k, n) to which the starts of k targets descend.
 
         Args:
             targets: k targets of the kinds of contacts of this search.
             is_local: True for short steps, which end at a minimum near the start.
+            tolerances: See `find`.
         """
         q = targets.starts(self._trials.robot.description)
         max_step = DESCENT.local_step if is_local else UNLIMITED_STEP
-        parameters = self._parameters(targets, max_step)
+        return self.descend_from(q, self.parameters(targets, max_step, tolerances))
+
+    def descend_from(self, q: Array, parameters: Array) -> Array:
+        """Return the local minima (k, n) to which configurations (k, n) descend."""
         return self._q(self._run(self._states(parameters, q), parameters))
 
-    def _parameters(self, targets: TargetBatch, max_step: float) -> Array:
+    def with_weights(self, parameters: Array, weights: Array) -> Array:
+        """Return parameters (k, np) with other weights (k, f, 2) of residuals."""
+        changed = parameters.copy()
+        changed[:, self._step.parameters.slice("weights")] = _scaled(weights).reshape(
+            len(weights), -1
+        )
+        return changed
+
+    @property
+    def robot(self) -> ArmHand:
+        """The robot."""
+        return self._trials.robot
+
+    def parameters(self, targets: TargetBatch, max_step: float, tolerances: Array | None) -> Array:
         """Return the parameters (k, np) of the descent."""
         contacts = self._step.contacts
         vectors = {f"{name}s": targets.vectors(f"{name}s") for name in contacts.data}
         values = {name: np.where(np.isnan(array), 0.0, array) for name, array in vectors.items()}
         lower, upper = targets.bounds(self._trials.robot.description)
-        bounds = {"weights": _weights(targets), "lower": lower, "upper": upper}
+        if tolerances is None:
+            tolerances = residual_tolerances(targets)
+        bounds = {"weights": _weights(tolerances), "lower": lower, "upper": upper}
         return self._step.parameters.pack_rows(
             {**values, **bounds, "max_step": max_step}, len(targets)
         )
@@ -349,14 +394,51 @@ class NearestSearch:
 
     def distances(self, targets: TargetBatch, owner: Rows, q: Array) -> Array:
         """Return (m,) sums of squared contact errors, each divided by its tolerance."""
-        misses = LocalRefinement(self._trials, targets).misses(owner, q)
+        misses = residual_norms(self._trials.robot, targets.rows(owner), q)
         tolerances = residual_tolerances(targets)[owner]
         ratios = np.divide(misses, tolerances, where=tolerances > 0, out=np.zeros_like(misses))
         return (ratios**2).sum(axis=(1, 2))
 
 
-def _weights(targets: TargetBatch) -> Array:
-    """Return (k, f, 2) weights of points and normals: inverse tolerances, the largest is 1."""
-    tolerances = residual_tolerances(targets)
-    inverse = np.divide(1.0, tolerances, where=tolerances > 0, out=np.zeros_like(tolerances))
-    return inverse / inverse.max(axis=(1, 2), keepdims=True)
+@dataclass(frozen=True, eq=False)
+class WeightedDescents:
+    """Descents of targets under changing weights.
+
+    Attributes:
+        search: The search.
+        targets: k targets.
+    """
+
+    search: NearestSearch
+    targets: TargetBatch
+
+    @cached_property
+    def _parameters(self) -> Array:
+        return self.search.parameters(self.targets, DESCENT.local_step, None)
+
+    def run(self, owner: Rows, q: Array, *, weights: Array) -> Array:
+        """Return the local minima (m, n) to which configurations descend.
+
+        Args:
+            owner: (m,) target index of each row.
+            q: (m, n) configurations [rad or m].
+            weights: (m, f, 2) weights of residuals.
+        """
+        return self.search.descend_from(
+            q, self.search.with_weights(self._parameters[owner], weights)
+        )
+
+    def misses(self, owner: Rows, q: Array) -> Array:
+        """Return (m, f, 2) residual norms, see `residual_norms`."""
+        return residual_norms(self.search.robot, self.targets.rows(owner), q)
+
+
+def _weights(tolerances: Array) -> Array:
+    """Return (k, f, 2) weights of residuals: inverse tolerances (k, f, 2), the largest is 1."""
+    return _scaled(np.divide(1.0, tolerances, where=tolerances > 0, out=np.zeros_like(tolerances)))
+
+
+def _scaled(weights: Array) -> Array:
+    """Return weights (k, f, 2) divided by the largest of each target."""
+    largest = weights.max(axis=(1, 2), keepdims=True)
+    return weights / np.where(largest > 0, largest, 1.0)

@@ -424,8 +424,9 @@ class Choice(ReprMixin):
         score: Score of the ranking, higher is better: smallest limit margin of the actuators that
             are not fixed, relative to half their range ("limits"); negative distance from q0,
             actuators relative to their ranges ("q0"); manipulability of the arm [m^3]
-            ("manipulability"); clearance beyond the margins of the scene [m] ("clearance"); or
-            the value of a score function.
+            ("manipulability"); clearance beyond the margins of the scene [m] ("clearance");
+            negative error ratio of a nearest configuration ("nearest"); or the value of a score
+            function.
         grasp: The grasp in the base frame.
 
     Example:

@@ -193,8 +193,7 @@ class LocalRefinement:
 
     def misses(self, owner: Rows, q: Array) -> Array:
         """Return (m, f, 2) residual norms of points [0.1 m] and normals; 0 where free."""
-        position, angle, _ = deviations(self.subproblems.robot, self.targets.rows(owner), q)
-        return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
+        return residual_norms(self.subproblems.robot, self.targets.rows(owner), q)
 
 
 def sample_trunks(
@@ -266,6 +265,12 @@ def side_palms(robot: ArmHand, q: Array) -> Array:
 def repeat_target(targets: TargetBatch, count: int) -> TargetBatch:
     """Return `count` copies of one target."""
     return targets.rows(np.zeros(count, dtype=np.intp))
+
+
+def residual_norms(robot: ArmHand, targets: TargetBatch, q: Array) -> Array:
+    """Return (k, f, 2) residual norms of points [0.1 m] and normals at q (k, n); 0 where free."""
+    position, angle, _ = deviations(robot, targets, q)
+    return np.nan_to_num(np.stack([position / LENGTH, 2 * np.sin(angle / 2)], axis=2))
 
 
 def residual_tolerances(targets: TargetBatch) -> Array:

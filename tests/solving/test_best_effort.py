@@ -221,6 +221,70 @@ def test_five_axis_arm_follows_infeasible_poses():
         q = solution.q
 
 
+def test_weights_replace_tolerances(robot):
+    points, normals = out_of_reach(robot, 4)
+    tolerance = ik.Tolerance(3e-3, 0.5)
+    plain = ik.Solver(robot, tolerance=tolerance)
+    pair = 1 / tolerance.position, 0.5 / np.sin(tolerance.angle / 2)
+    scaled = dict.fromkeys(robot.fingers, pair)
+    weighted = ik.Solver(robot).solve_batch(
+        points, normals, best_effort=ik.BestEffort(weights=scaled)
+    )
+    expected = plain.solve_batch(points, normals, best_effort=True)
+    rows = (weighted.status == ik.Status.NEAREST) & (expected.status == ik.Status.NEAREST)
+    assert rows.any()
+    costs = [distances(plain, points, normals, batch.q) for batch in (weighted, expected)]
+    np.testing.assert_allclose(costs[0][rows], costs[1][rows], rtol=1e-3)
+    by_position = ik.Solver(robot).solve_batch(
+        points, normals, best_effort=ik.BestEffort(weights=dict.fromkeys(scaled, (1.0, 0.0)))
+    )
+    position = np.linalg.norm(robot.contacts(by_position.q)[0] - points, axis=2)
+    others = np.linalg.norm(robot.contacts(weighted.q)[0] - points, axis=2)
+    assert ((position**2).sum(axis=1) <= (others**2).sum(axis=1) * (1 + 1e-6))[rows].all()
+
+
+def test_minimax_lowers_the_largest_error(robot):
+    solver = ik.Solver(robot)
+    points, normals = out_of_reach(robot, 8)
+    squares = solver.solve_batch(points, normals, best_effort=True)
+    minimax = solver.solve_batch(points, normals, best_effort=ik.BestEffort(minimax=True))
+    rows = squares.status == ik.Status.NEAREST
+    assert (minimax.error_ratio[rows] <= squares.error_ratio[rows] * (1 + 1e-6)).all()
+    assert (minimax.error_ratio[rows] < 0.99 * squares.error_ratio[rows]).any()
+
+
+def test_choose_returns_the_nearest_of_infeasible_candidates(robot):
+    solver = ik.Solver(robot)
+    points, normals = robot.contacts(robot.home)
+    grasps = [
+        ik.Grasp(
+            {
+                finger: ik.Contact(point + np.array([0.0, 0.0, height]), normal)
+                for finger, point, normal in zip(robot.fingers, points, normals, strict=True)
+            }
+        )
+        for height in (3.0, 2.0)
+    ]
+    assert len(solver.choose(grasps)) == 0
+    ranking = solver.choose(grasps, best_effort=True)
+    assert ranking.answered == 0
+    assert [choice.candidate for choice in ranking] == [1, 0]
+    assert all(choice.solution.status is ik.Status.NEAREST for choice in ranking)
+    assert ranking[0].score == pytest.approx(-ranking[0].solution.error_ratio)
+
+
+@pytest.mark.parametrize("pair", [(0.0, 0.0), (-1.0, 1.0), (np.nan, 1.0), (1.0,), "heavy"])
+def test_invalid_weights_are_refused(pair):
+    with pytest.raises(ik.errors.InputError, match=r"weights.*thumb"):
+        ik.BestEffort(weights={"thumb": pair})
+
+
+def test_weights_of_unknown_fingers_are_refused(robot):
+    options = ik.BestEffort(weights={"tail": (1.0, 1.0)})
+    with pytest.raises(ik.errors.UnknownNameError, match="tail"):
+        ik.Solver(robot).solve_batch(*robot.contacts(robot.home[None]), best_effort=options)
+
+
 @pytest.mark.parametrize("value", ["global", 2, None])
 def test_unknown_best_effort_is_refused(robot, value):
     with pytest.raises(ik.errors.InputError, match=f"best_effort.*{value!r}"):

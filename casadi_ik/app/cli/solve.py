@@ -188,6 +188,7 @@ def _drawing(path: Path, grasp: Grasp) -> Callable[..., Any]:
     opt.Q0,
     Option("--limit N", "maximum number of solutions", 10),
     Option("--per-candidate N", "maximum number of solutions per candidate", 1),
+    Option("--best-effort", "nearest configurations if there is no solution"),
     opt.RANDOM_SEED,
     *opt.TOLERANCES,
     opt.MAX_RESTARTS,
@@ -261,6 +262,7 @@ def choose(args: Arguments) -> CommandResult:
             args.prefer,
             args.seed,
             per_candidate=args.per_candidate,
+            best_effort=bool(args.best_effort),
         )
     names = [grasp.name for grasp in grasps]
     write_json(args.out, ranking_data(ranking, names))
@@ -268,5 +270,5 @@ def choose(args: Arguments) -> CommandResult:
     report = ranking_report(ranking, names, path.name, report_units(args))
     output_lines = files({"--out": args.out})
     return CommandResult.of_parts(
-        bool(ranking.entries), report, *(Text(f"  {note}") for note in notes), *output_lines
+        ranking.answered > 0, report, *(Text(f"  {note}") for note in notes), *output_lines
     )
