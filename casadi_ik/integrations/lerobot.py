@@ -30,6 +30,9 @@ POINT_KEYS, NORMAL_KEYS = ("x", "y", "z"), ("nx", "ny", "nz")
 """Suffixes of the keys of a contact in an action."""
 
 
+PRECISION = 1e-5
+"""Position tolerance of a pose [m]: larger errors are minimised."""
+
 MAX_ANGLE_TOLERANCE = math.radians(30)
 """Largest tolerance that a small orientation weight leads to [rad]."""
 
@@ -40,7 +43,8 @@ class ArmKinematics:
     Replaces `lerobot.model.kinematics.RobotKinematics` in `InverseKinematicsEEToJoints`,
     `EEReferenceAndDelta` and other steps: positions in degrees, poses (4, 4) [m]. Values after
     those of the arm (such as a gripper's) are unchanged. Where no configuration has the pose, out
-    of reach or with five axes, the arm moves to the nearest one of its branch, see `status`.
+    of reach or with five axes, the arm moves to the minimum of the weighted squared errors that is
+    reached from its current positions, see `status`.
 
     Attributes:
         joint_names: Motors of the arm, in the order of all arrays.
@@ -77,8 +81,8 @@ class ArmKinematics:
             current_joint_pos: Positions of the arm [deg], followed by values that are unchanged.
             desired_ee_pose: (4, 4) Pose in the base frame.
             position_weight: Weight of squared position errors [1/m^2].
-            orientation_weight: Weight of squared angles [1/rad^2], which sets the tolerance of the
-                angle; 0: only the position is constrained (arms without a hand).
+            orientation_weight: Weight of squared angles [1/rad^2]; 0: only the position is
+                constrained (arms without a hand).
         """
         positions = np.array(current_joint_pos, dtype=float)
         q0 = self._configuration(positions)
@@ -109,9 +113,8 @@ class ArmKinematics:
         finger = robot.fingers[0]
         if not orientation_weight:
             return Grasp({finger: Contact(tip[:3, 3])})
-        position = self._solver.tolerances[finger].position
         ratio = math.sqrt(position_weight / orientation_weight)
-        tolerance = Tolerance(position, min(position * ratio, MAX_ANGLE_TOLERANCE))
+        tolerance = Tolerance(PRECISION, min(PRECISION * ratio, MAX_ANGLE_TOLERANCE))
         return Grasp({finger: dataclasses.replace(Contact.from_pose(tip), tolerance=tolerance)})
 
 
