@@ -24,6 +24,7 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import joint_positions, joints_below, link_poses, rigid_bodies
 from casadi_ik.model.link_shapes import Touching, capsules_of
 from casadi_ik.model.parts import HAND_PREFIX, RobotPart
+from casadi_ik.model.pose import inverse
 from casadi_ik.model.schema import ShapeEntry
 from casadi_ik.model.xml_tree import RobotTree
 
@@ -87,11 +88,7 @@ def allowed_overlaps(
     """
     poses = _random_poses(part, np.random.default_rng(0))
     bodies, neighbours = rigid_bodies(part)
-    capsules = {
-        link: [capsule for entry in entries for capsule in capsules_of(entry)]
-        for link, entries in shapes.items()
-    }
-    segments = {link: _segments(entries, poses[link]) for link, entries in capsules.items()}
+    capsules = {link: _posed_capsules(entries, poses[link]) for link, entries in shapes.items()}
 
     @cache
     def tree(link: str) -> CollisionTree:
@@ -106,9 +103,7 @@ def allowed_overlaps(
                 continue
             if frozenset((bodies[link], bodies[other_link])) in neighbours:
                 continue
-            clearance = _clearances(
-                (capsules[link], capsules[other_link]), (segments[link], segments[other_link])
-            )
+            clearance = _clearances(capsules[link], capsules[other_link])
             pair: MeshPair | None = None
             # Only the points of a mesh are known if it has too many triangles.
             if all(name in meshes and len(meshes[name].triangles) for name in (link, other_link)):
@@ -133,31 +128,63 @@ def _random_poses(part: RobotPart | RobotDescription, rng: np.random.Generator) 
     }
 
 
-def _inverse(poses: Array) -> Array:
-    """Return the inverses of poses (k, 4, 4)."""
-    inverses = np.zeros(poses.shape) + np.eye(4)
-    inverses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
-    inverses[:, :3, 3] = -np.einsum("kji,kj->ki", poses[:, :3, :3], poses[:, :3, 3])
-    return inverses
+@dataclass(frozen=True, eq=False)
+class PosedCapsules:
+    """The capsules of a link in k configurations, in the root's frame.
+
+    Attributes:
+        segments: (k, c, 6) centres and half axes [m].
+        radii: (c,) radii [m].
+        center: (k, 3) centre of a sphere around all capsules [m].
+        radius: Radius of this sphere [m].
+    """
+
+    segments: Array
+    radii: Array
+    center: Array
+    radius: float
 
 
-Capsules = Sequence[tuple[Array, Array, float]]
+def _posed_capsules(entries: Sequence[ShapeEntry], poses: Array) -> PosedCapsules:
+    """Return the capsules of a link at poses (k, 4, 4)."""
+    capsules = [capsule for entry in entries for capsule in capsules_of(entry)]
+    centers, half_axes, radii = (np.array(values) for values in zip(*capsules, strict=True))
+    middle = centers.mean(axis=0)
+    reach = np.linalg.norm(centers - middle, axis=1) + np.linalg.norm(half_axes, axis=1) + radii
+    rotations, origins = poses[:, :3, :3], poses[:, :3, 3]
+    segments = np.concatenate(
+        [
+            np.einsum("kij,cj->kci", rotations, centers) + origins[:, None],
+            np.einsum("kij,cj->kci", rotations, half_axes),
+        ],
+        axis=2,
+    )
+    return PosedCapsules(segments, radii, rotations @ middle + origins, float(reach.max()))
 
 
-def _clearances(capsules: tuple[Capsules, Capsules], segments: tuple[Array, Array]) -> Array:
+def _near_rows(centers: Array, other_centers: Array, distance: float) -> NDArray[np.intp]:
+    """Return the rows of points (k, 3) whose distance is below a value [m]."""
+    offsets = centers - other_centers
+    return np.flatnonzero(np.einsum("ki,ki->k", offsets, offsets) < (distance + SPHERE_MARGIN) ** 2)
+
+
+def _clearances(first: PosedCapsules, second: PosedCapsules) -> Array:
     """Return the overlaps of the capsules of two links as negative distances (k,) [m].
 
     Configurations in which the bounding spheres of all capsules are separate get infinity.
     """
     clearance = np.full(OVERLAP_SAMPLING.samples, np.inf)
-    for i, (_, _, radius) in enumerate(capsules[0]):
-        for j, (_, _, other_radius) in enumerate(capsules[1]):
-            first, second = segments[0][:, i], segments[1][:, j]
-            half_lengths = np.linalg.norm(first[0, 3:]) + np.linalg.norm(second[0, 3:])
-            reach = half_lengths + radius + other_radius + SPHERE_MARGIN
-            rows = np.flatnonzero(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) < reach)
-            distance, _ = between_segments(first[rows], second[rows])
-            clearance[rows] = np.minimum(clearance[rows], distance - radius - other_radius)
+    near = _near_rows(first.center, second.center, first.radius + second.radius)
+    if not len(near):
+        return clearance
+    for i, radius in enumerate(first.radii):
+        for j, other_radius in enumerate(second.radii):
+            segments, other_segments = first.segments[near, i], second.segments[near, j]
+            radii = radius + other_radius
+            half_lengths = np.linalg.norm(segments[0, 3:]) + np.linalg.norm(other_segments[0, 3:])
+            rows = _near_rows(segments[:, :3], other_segments[:, :3], half_lengths + radii)
+            distance, _ = between_segments(segments[rows], other_segments[rows])
+            clearance[near[rows]] = np.minimum(clearance[near[rows]], distance - radii)
     return clearance
 
 
@@ -181,7 +208,7 @@ class MeshPair:
         """Return in which configurations the meshes intersect; see `CollisionTree.intersects`."""
         first, second = map(self.tree, self.links)
         pose, other_pose = (poses[configurations] for poses in self.poses)
-        return first.intersects(second, _inverse(pose) @ other_pose, stop_at_first)
+        return first.intersects(second, inverse(pose) @ other_pose, stop_at_first)
 
 
 def _allowed_overlap(
@@ -227,21 +254,6 @@ def _allowed_overlap(
     ):
         return [Touching(links, reason + ", which these shapes cannot distinguish")]
     return [Touching(links, reason + ", all deeper", depth)]
-
-
-def _segments(capsules: Capsules, poses: Array) -> Array:
-    """Return the centres and half axes (k, c, 6) of a link's capsules in the root's frame.
-
-    Args:
-        capsules: The capsules in the link's frame.
-        poses: (k, 4, 4) poses of the link.
-    """
-    rotations, origins = poses[:, :3, :3], poses[:, None, :3, 3]
-    centres, half_axes = (
-        np.einsum("kij,cj->kci", rotations, np.stack([capsule[i] for capsule in capsules]))
-        for i in (0, 1)
-    )
-    return np.concatenate([centres + origins, half_axes], axis=2)
 
 
 def robot_shapes(

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
+from casadi_ik.errors import optional_import
 from casadi_ik.files.arrays import Array
+
+with optional_import("shapes of imported links"):
+    from scipy.spatial import ConvexHull, QhullError
 
 Rows = NDArray[np.intp]
 Boxes = tuple[Array, Array]
@@ -14,19 +20,39 @@ Boxes = tuple[Array, Array]
 MAX_PAIRS = 4096
 """Maximum number of pairs of boxes in one array operation; more do not fit into a core's cache."""
 
+MAX_HULL_STEPS = 30
+"""Maximum number of steps towards the nearest points of two convex hulls."""
+
+MIN_GAP = 1e-9
+"""Gap above which two convex hulls are regarded as separate, for rounding errors [m]."""
+
 
 class CollisionTree:
-    """A mesh in a balanced binary tree of axis-aligned boxes.
+    """A mesh in a balanced binary tree of axis-aligned boxes, and its convex hull.
 
     Level k has 2^k boxes; each box of the last level holds one triangle. Triangles are repeated to
-    fill the last level.
+    fill the last level. Hull and tree are built when they are needed.
     """
 
     def __init__(self, triangles: Array) -> None:
-        """Build the tree of triangles (t, 3, 3) [m]."""
-        depth = max(len(triangles) - 1, 0).bit_length()
-        order = np.resize(np.arange(len(triangles)), 2**depth)[None]
-        centroids = triangles.mean(axis=1)
+        """Store the triangles (t, 3, 3) [m]."""
+        self.triangles = triangles
+
+    @cached_property
+    def hull(self) -> Array:
+        """Return the vertices (v, 3) of the convex hull; all vertices of a flat mesh."""
+        points = self.triangles.reshape(-1, 3)
+        try:
+            return points[ConvexHull(points).vertices]
+        except (QhullError, ValueError):  # the points are in a plane, or too few
+            return points
+
+    @cached_property
+    def leaves(self) -> Array:
+        """Return the triangles (n, 3, 3) in the order of the boxes of the last level."""
+        depth = max(len(self.triangles) - 1, 0).bit_length()
+        order = np.resize(np.arange(len(self.triangles)), 2**depth)[None]
+        centroids = self.triangles.mean(axis=1)
         while order.shape[1] > 1:  # halve each box along its longest edge
             points = centroids[order]
             longest = np.ptp(points, axis=1).argmax(axis=1)
@@ -35,15 +61,23 @@ class CollisionTree:
             partition = coordinates.argpartition(middle, axis=1)
             order = np.take_along_axis(order, partition, axis=1)
             order = order.reshape(2 * len(order), -1)
-        leaves = triangles[order[:, 0]]
-        self.corners = np.ascontiguousarray(leaves.transpose(1, 2, 0))
-        """(3, 3, n): corner, coordinate, triangle."""
-        low, high = leaves.min(axis=1), leaves.max(axis=1)
-        self.levels = [_boxes(low, high)]
-        for _ in range(depth):
+        return self.triangles[order[:, 0]]
+
+    @cached_property
+    def corners(self) -> Array:
+        """Return the leaves as (3, 3, n): corner, coordinate, triangle."""
+        return np.ascontiguousarray(self.leaves.transpose(1, 2, 0))
+
+    @cached_property
+    def levels(self) -> list[Boxes]:
+        """Return the boxes of each level, from the box of the mesh to those of the triangles."""
+        low, high = self.leaves.min(axis=1), self.leaves.max(axis=1)
+        levels = [_boxes(low, high)]
+        while len(low) > 1:
             low = low.reshape(-1, 2, 3).min(axis=1)
             high = high.reshape(-1, 2, 3).max(axis=1)
-            self.levels.insert(0, _boxes(low, high))
+            levels.insert(0, _boxes(low, high))
+        return levels
 
     def intersects(
         self, other_tree: CollisionTree, poses: Array, stop_at_first: bool = False
@@ -60,6 +94,16 @@ class CollisionTree:
         Returns:
             (k,) True where the meshes intersect; with `stop_at_first` at least one of these poses.
         """
+        crossing = np.zeros(len(poses), bool)
+        rows = np.flatnonzero(~hulls_are_separate(self.hull, other_tree.hull, poses))
+        if len(rows):  # most meshes that do not intersect are separated by a plane
+            crossing[rows] = self._triangles_cross(other_tree, poses[rows], stop_at_first)
+        return crossing
+
+    def _triangles_cross(
+        self, other_tree: CollisionTree, poses: Array, stop_at_first: bool
+    ) -> NDArray[np.bool_]:
+        """Return the result of `intersects` by traversal of both trees."""
         crossing = np.zeros(len(poses), bool)
         rotations = np.ascontiguousarray(poses[:, :3, :3].transpose(1, 2, 0))
         translations = np.ascontiguousarray(poses[:, :3, 3].T)
@@ -108,6 +152,44 @@ class CollisionTree:
                 (min(level + 1, last[0]), min(other_level + 1, last[1]), rows, columns, pose)
             )
         return crossing
+
+
+def hulls_are_separate(points: Array, other_points: Array, poses: Array) -> NDArray[np.bool_]:
+    """Return in which relative poses a plane between two convex hulls is found (k,).
+
+    The method of Frank and Wolfe moves a point of the difference of the hulls towards the origin.
+    The hulls are separate if the whole difference is on the far side of a plane through the origin
+    that is perpendicular to the vector to this point. Hulls that nearly touch may not be decided.
+
+    Args:
+        points: (v, 3) vertices of the first hull.
+        other_points: (w, 3) vertices of the second hull, in its frame.
+        poses: (k, 4, 4) poses of the second frame in the first one.
+
+    Source: E. G. Gilbert, An iterative procedure for computing the minimum of a quadratic form on a
+    convex set, 1966.
+    """
+    rotations, origins = poses[:, :3, :3], poses[:, :3, 3]
+    is_separate = np.zeros(len(poses), bool)
+    difference = points.mean(axis=0) - (rotations @ other_points.mean(axis=0) + origins)
+    rows = np.arange(len(poses))
+    for _ in range(MAX_HULL_STEPS):
+        rotation, vector = rotations[rows], difference[rows]
+        nearest = points[(vector @ points.T).argmin(axis=1)]
+        local_vector = np.einsum("kij,ki->kj", rotation, vector)
+        other_nearest = other_points[(local_vector @ other_points.T).argmax(axis=1)]
+        other_nearest = np.einsum("kij,kj->ki", rotation, other_nearest) + origins[rows]
+        extreme = nearest - other_nearest
+        gap = np.einsum("ki,ki->k", extreme, vector)
+        is_separate[rows] = gap > MIN_GAP * np.linalg.norm(vector, axis=1)
+        step = extreme - vector
+        squared_length = np.maximum(np.einsum("ki,ki->k", step, step), 1e-30)  # [m^2]
+        fraction = np.clip(-np.einsum("ki,ki->k", vector, step) / squared_length, 0, 1)
+        difference[rows] += fraction[:, None] * step
+        rows = rows[~is_separate[rows]]
+        if not len(rows):
+            break
+    return is_separate
 
 
 def _boxes(low: Array, high: Array) -> Boxes:
