@@ -140,14 +140,8 @@ def export_solver(
     Raises:
         UnsupportedError: The robot cannot be exported in this way.
     """
-    sides = robot.description.sides
     if not robot.actuators:
         raise UnsupportedError(f"export: {robot.name} has no actuators; expected at least one")
-    if sides and single and capacity is not None:
-        raise UnsupportedError(
-            f"--single: {robot.name} has several arms; expected no --scene, because its collisions "
-            "are checked in double precision only"
-        )
     if single and follow:
         raise UnsupportedError("--follow: computes in double precision; expected no --single")
     method, solver = prepared_method(robot), Solver(robot)

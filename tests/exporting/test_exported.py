@@ -72,14 +72,6 @@ def test_stored_targets_bit_for_bit_under_sanitizers(project):
     assert foreign <= LIBM | COMPILERS
 
 
-@pytest.mark.slow
-def test_exported_collision_checks_use_double_precision(tmp_path, capsys):
-    words = ["export", "g1+dex3", "--scene", "8", "--single", "--out", str(tmp_path / "g1")]
-    assert main(words) == 2
-    assert re.search(r"--single: g1\+dex3 .*--scene", capsys.readouterr().err)
-    assert not any(tmp_path.iterdir())
-
-
 IN_A_SCENE = """
 #include <stdio.h>
 #include "arm.h"

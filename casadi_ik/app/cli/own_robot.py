@@ -384,8 +384,7 @@ def export(args: Arguments) -> CommandResult:
 
     --single computes in single precision only. Solutions also pass the
     double-precision check but may differ from those of this package; the test of the
-    project allows one missed target in a thousand. For robots with several arms,
-    --single excludes --scene.
+    project allows one missed target in a thousand.
 
     With --scene a target is solved only if the robot does not collide. If a solution
     collides, other arm configurations and then other hand poses are examined.
