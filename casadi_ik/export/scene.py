@@ -241,12 +241,8 @@ class SceneSources:
         marks |= self.arm_marks
         real = marks["REAL"]
         scratch_type = "double" if self.single is None else "int64_t"
-        wasm, js, types = (
-            render_template(name, marks) for name in ("scene_wasm.c", "scene.js", "scene.d.ts")
-        )
-        return {
-            "SCENE_TYPES": render_template("scene_types.h", marks),
-            "SCENE_CALLS": render_template("scene_calls.h", marks),
+        return marks | {
+            "SCENE": "",
             "SCENE_FIELDS": (
                 f"  {real} clearance; /* [m], negative in collision */\n"
                 "  int64_t nearest[2]; /* indices of links, or -1 - number of a solid */\n"
@@ -256,11 +252,6 @@ class SceneSources:
             "SCENE_SEARCH": render_template("scene_search.c", marks),
             "SCENE_INIT": f"  {self.prefix}_scene_init(solver);\n",
             "SCENE_BEGIN": self.begin,
-            "SCENE_WASM": wasm,
-            "SCENE_JS": js,
-            "SCENE_DTS": types,
-            "SCENE_SHAPES_JS": render_template("scene_shapes.js", marks),
-            "SCENE_SHAPES_DTS": render_template("scene_shapes.d.ts", marks),
             "SCENE_STATUS_TYPE": " | 6",
             "SCENE_STATUS_JS": "  COLLISION: 6,\n",
             "SCENE_STATUS_DTS": (

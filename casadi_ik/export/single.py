@@ -214,20 +214,23 @@ def single_precision_substitutes(single: SinglePrecision) -> dict[str, str]:
 
 
 TEMPLATE_MARK = re.compile(r"@([A-Z_]+)(\??)@")
-TEMPLATE_SECTION = re.compile(r"^@([A-Z_]+)\{@\n(.*?)^@\}@\n", re.MULTILINE | re.DOTALL)
+TEMPLATE_SECTION = re.compile(r"^@([A-Z_]+)\{@\n((?:(?!@[A-Z_]+\{@\n).*\n)*?)@\}@\n", re.MULTILINE)
+"""A section without inner sections."""
 
 
 def render_template(name: str, substitutes: Mapping[str, str]) -> str:
     """Return the text of `templates/<name>` with all marks replaced.
 
     A mark `@NAME?@` is optional: it is removed if there is no substitute. Lines between `@NAME{@`
-    and `@}@` are omitted unless there is a substitute for NAME.
+    and `@}@` are omitted unless there is a substitute for NAME; sections may contain others.
 
     Raises:
         KeyError: A mark that is not optional has no substitute.
     """
     text = (resources.files("casadi_ik.export") / "templates" / name).read_text(encoding="utf-8")
-    text = TEMPLATE_SECTION.sub(lambda m: m[2] if m[1] in substitutes else "", text)
+    count = 1
+    while count:
+        text, count = TEMPLATE_SECTION.subn(lambda m: m[2] if m[1] in substitutes else "", text)
     return TEMPLATE_MARK.sub(
         lambda m: substitutes.get(m[1], "") if m[2] else substitutes[m[1]], text
     )

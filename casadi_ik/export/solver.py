@@ -54,7 +54,7 @@ from casadi_ik.solve.target_builder import contacts_from_palms
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
 
 
-def palm_substitutes(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
+def palm_substitutes(robot: ArmHand, prefix: str) -> dict[str, str]:
     """Return the substitutes for palm targets; empty if contacts leave the palm free.
 
     They are empty for robots without an arm or with several arms too.
@@ -71,13 +71,7 @@ def palm_substitutes(robot: ArmHand, prefix: str, real: str) -> dict[str, str]:
         {"HOME_PALM": pose, "OF_HAND": np.isin(robot.actuators, motors).astype(int)}
     )
     marks = {"PREFIX": prefix, "GUARD": prefix.upper()}
-    return {
-        "PALM_CALLS": render_template("palm.h", marks | {"REAL": real}),
-        "PALM": "\n" + constants + render_template("palm.c", marks),
-        "PALM_WASM": render_template("palm_wasm.c", marks),
-        "PALM_JS": render_template("palm.js", marks),
-        "PALM_DTS": render_template("palm.d.ts", marks),
-    }
+    return {"PALM": "\n" + constants + render_template("palm.c", marks)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,17 +96,13 @@ class FollowSources:
             "GUARD": self.prefix.upper(),
             "CYCLE": standalone_source(row_major(cycle.graph.function), CodeOptions()),
             "FOLLOW_CONSTANTS": self._constants(cycle),
+        }
+        substitutes = {
+            "FOLLOW": "",
             "FOLLOW_STATE": str(cycle.state.size),
             "FOLLOW_PARAMETERS": str(cycle.parameters.size),
             "FOLLOW_RECORD": str(cycle.record.size),
             "FOLLOW_TRAIL": str(recovery.CAPACITY),
-        }
-        substitutes = {
-            "FOLLOW": "",
-            "FOLLOW_CALLS": render_template("follow.h", marks),
-            "FOLLOW_WASM": render_template("follow_wasm.c", marks),
-            "FOLLOW_JS": render_template("follow.js", marks),
-            "FOLLOW_DTS": render_template("follow.d.ts", marks),
             "FOLLOW_STATUS_JS": (
                 "export const FollowStatus = Object.freeze({\n"
                 "  HOLDING: 0,\n  FOLLOWING: 1,\n  LATE: 2,\n  MISSED: 3,\n});\n"
@@ -408,7 +398,7 @@ class SolverSources:
         substitutes |= (
             DOUBLE_PRECISION if self.single is None else single_precision_substitutes(self.single)
         )
-        substitutes |= palm_substitutes(robot, self.prefix, substitutes["REAL"])
+        substitutes |= palm_substitutes(robot, self.prefix)
         lower, upper = self._bounds
         single = self.single
         single_constants = (None, None) if single is None else (single.reals, single.arrays)

@@ -39,7 +39,58 @@ enum {
 extern const char *const @PREFIX@_finger_names[@GUARD@_FINGERS];
 extern const char *const @PREFIX@_motor_names[@GUARD@_MOTORS];
 extern const @REAL@ @PREFIX@_lower[@GUARD@_MOTORS], @PREFIX@_upper[@GUARD@_MOTORS];
-@SCENE_TYPES?@
+@SCENE{@
+
+/* Capacity of the scene, and the kinds of its solids. */
+enum {
+  @GUARD@_SCENE = @CAPACITY@,
+@KINDS_C@
+  @GUARD@_NOTHING = -1
+};
+enum { @GUARD@_COLLISION = 6 /* contacts and limits are met, but the robot is in collision */ };
+
+/* Shapes of the robot: capsules, then boxes and cylinders. */
+enum { @GUARD@_CAPSULES = @CAPSULES@, @GUARD@_OWN_SOLIDS = @OWN_SOLIDS@, @GUARD@_LINKS = @LINKS@ };
+extern const char *const @PREFIX@_link_names[@GUARD@_LINKS];
+
+typedef struct {
+  int64_t kind;
+  @REAL@ size[3], reach;
+  int64_t first, planes;
+} @PREFIX@_solid;
+
+typedef struct {
+  @REAL@ margin;
+  @PREFIX@_solid solids[@SOLIDS@];
+  @REAL@ poses[12 * @GUARD@_SCENE];
+  int32_t grasped[@GUARD@_SCENE], pairs[2 * @MAX_PAIRS@];
+  @REAL@ offsets[@MAX_PAIRS@];
+  int64_t idle_pairs_begin, idle_pairs_end, n_pairs;
+  /* State of the search for a collision-free answer. */
+@ONE_ARM{@
+  int64_t is_searching, preference_dropped, restart, candidate, n_hands, next_hand;
+  int64_t iterations, restarts, has_new_hand, n_recorded_hands, n_free_hands;
+@}@
+@BODY{@
+  int64_t group_ends[@PAIR_GROUPS@], has_pair_list;
+  int64_t is_searching, preference_dropped, restart, candidate, trunk_stage, trunk_trial, task;
+  int64_t has_new_hand, iterations, restarts;
+@}@
+  @REAL@ best_q[@GUARD@_MOTORS], best_surplus; /* answer of largest clearance; clearance - margin */
+@BODY{@
+  /* Collision-free hands of each side, and the poses of their palms. */
+  int64_t n_hands[@SIDES@];
+  @REAL@ hands[@SIDES@][@MAX_HANDS@][@GUARD@_MOTORS], palms[@SIDES@][@MAX_HANDS@][12];
+@}@
+@ONE_ARM{@
+  /* Hands to try, sorted by rating; coordinates of all hand poses, and of collision-free ones. */
+  @REAL@ hands[@N_CANDIDATES@ * @GUARD@_MOTORS], ratings[@N_CANDIDATES@];
+  @REAL@ recorded_hands[@MAX_HANDS@ * @N_HAND_COORDINATES@];
+  @REAL@ free_hands[@MAX_HANDS@ * @N_HAND_COORDINATES@];
+@}@
+} @PREFIX@_scene;
+@}@
+
 /* Work memory that the parts of a solver share. */
 typedef struct {
   @REAL@ w[@W@];
@@ -83,7 +134,98 @@ int @PREFIX@_solve(@PREFIX@_solver *solver, const @REAL@ *points, const @REAL@ *
 /* Computes the contact points and outward normals of the fingertips at a configuration, three numbers
  * per finger each. Only the work memory of the solver is used. */
 void @PREFIX@_contacts(@PREFIX@_solver *solver, const @REAL@ *q, @REAL@ *points, @REAL@ *normals);
-@PALM_CALLS?@@SCENE_CALLS?@@FOLLOW_CALLS?@
+@PALM{@
+
+/* Computes the contacts of a hand posture at a palm pose (rotation row by row, then the origin), as
+ * a target of @PREFIX@_solve and @PREFIX@_begin. posture has a number per motor; those of the arm are ignored.
+ * Returns 0, or @GUARD@_BAD_INPUT if the pose is not a rigid motion or a motor exceeds its limits. */
+int @PREFIX@_touched(@PREFIX@_solver *solver, const @REAL@ *palm, const @REAL@ *posture,
+                     @REAL@ *points, @REAL@ *normals);
+
+/* Solve for the arm at a palm pose with a hand posture; otherwise as @PREFIX@_begin and
+ * @PREFIX@_solve. */
+int @PREFIX@_begin_palm(@PREFIX@_solver *solver, const @REAL@ *palm, const @REAL@ *posture,
+                        const @REAL@ *q0);
+int @PREFIX@_solve_palm(@PREFIX@_solver *solver, const @REAL@ *palm, const @REAL@ *posture,
+                        const @REAL@ *q0);
+@}@
+@SCENE{@
+
+/* Places solid `number` (0 to @GUARD@_SCENE - 1) in the scene, or removes it (kind @GUARD@_NOTHING). pose is
+ * the rotation row by row, then the origin (12 numbers). A grasped solid may be touched by the links
+ * of fingertip pads that have a contact.
+ *
+ * A target is solved only if the robot collides neither with a solid nor with itself; self-collision
+@ONE_ARM{@
+ * is checked in an empty scene too. If an answer collides, the solver examines other arm
+ * configurations for the same hand pose, and then up to @MAX_HAND_FITS@ other hand poses with theirs, which may
+ * take as long as that many solves. If all of them collide, the status is @GUARD@_COLLISION, and q is
+ * the answer of largest clearance. */
+@}@
+@BODY{@
+ * is checked in an empty scene too. If an answer collides, the solver examines up to @MAX_TRUNK_TRIALS@
+ * other trunk and arm configurations for the same hand poses, with other arms at each of them, and in
+ * between up to @MAX_HAND_FITS@ other hand poses, which may take as long as that many solves. If all of them
+ * collide, the status is @GUARD@_COLLISION, and q is the answer of largest clearance. */
+@}@
+int @PREFIX@_set_solid(@PREFIX@_solver *solver, int number, int kind, const @REAL@ *size,
+                       const @REAL@ *pose, int grasped);
+
+/* Sets the required clearance [m]; default: 0. */
+void @PREFIX@_set_margin(@PREFIX@_solver *solver, @REAL@ margin);
+
+/* Returns the clearance of a configuration [m], and stores the nearest pair in solver->nearest. */
+@REAL@ @PREFIX@_clearance(@PREFIX@_solver *solver, const @REAL@ *q);
+
+/* Computes the poses of the robot's shapes: six numbers per capsule (middle of its segment, and the
+ * vector from there to its end), then twelve per solid (rotation row by row, origin). */
+void @PREFIX@_shapes(@PREFIX@_solver *solver, const @REAL@ *q, @REAL@ *poses);
+@}@
+@FOLLOW{@
+
+/* Status of a cycle of a follower. */
+enum {
+  @GUARD@_HOLDING = 0,   /* invalid frame: the motors decelerate to rest and wait */
+  @GUARD@_FOLLOWING = 1, /* all contacts are within tolerance */
+  @GUARD@_LATE = 2,      /* velocity and acceleration limits delay the motors */
+  @GUARD@_MISSED = 3     /* no configuration on this branch meets the contacts */
+};
+
+/* Recovery of a follower that is stuck: a trail of postures that it has passed, and a line to one. */
+typedef struct {
+  double trail[@FOLLOW_TRAIL@][@GUARD@_MOTORS], start[@GUARD@_MOTORS], line[@GUARD@_MOTORS];
+  double least_since, least_ratio, longest_step, done, line_step, next_step, line_max_step, line_change;
+  int64_t count, cycles_to_check, check_cycles, patience, comparisons, cycles_stuck, candidate, destination;
+  int64_t is_returning, has_line, has_met;
+} @PREFIX@_recovery;
+
+/* A robot that follows moving contacts. Its results are q (positions of the motors at the end of the
+ * cycle), velocity, the errors and status. The other members are private. */
+typedef struct {
+  double q[@GUARD@_MOTORS], velocity[@GUARD@_MOTORS];
+  double position_error[@GUARD@_FINGERS], angle_error[@GUARD@_FINGERS]; /* of q; 0 where free */
+  int64_t status;
+  double period, max_change[@GUARD@_MOTORS];
+  double state[@FOLLOW_STATE@], new_state[@FOLLOW_STATE@];
+  double parameters[@FOLLOW_PARAMETERS@], record[@FOLLOW_RECORD@];
+  @PREFIX@_recovery recovery;
+} @PREFIX@_follower;
+
+/* Starts at rest at q0, or at home if that is a null pointer. period is the time between two cycles
+ * [s]. velocity and acceleration are limits of the motors; null pointers select the velocities of the
+ * robot's description, and accelerations that reach them from rest in a quarter of a second. Returns
+ * 0, or @GUARD@_BAD_INPUT if a value is not finite or not positive; the follower is unusable then. */
+int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double period,
+                         const double *velocity, const double *acceleration);
+
+/* Computes one cycle. Positions, velocities and accelerations of the motors stay within limits for all
+ * targets. points and normals are as in @PREFIX@_begin. palm is a pose of the palm (rotation row by row,
+ * then the origin) that is used as far as the contacts leave the palm free; it may be a null pointer.
+ * An invalid frame is not an error; its status is @GUARD@_HOLDING. Collisions are not checked. */
+int @PREFIX@_follow(@PREFIX@_follower *follower, const double *points, const double *normals,
+                    const double *palm);
+@}@
+
 #ifdef __cplusplus
 }
 #endif

@@ -6,7 +6,15 @@ export const motors = Object.freeze([@MOTOR_NAMES@]);
 export const lower = Object.freeze(@LOWER_JSON@);
 export const upper = Object.freeze(@UPPER_JSON@);
 export const home = Object.freeze(@HOME_JSON@);
-@SCENE_SHAPES_JS?@
+@SCENE{@
+
+export const links = Object.freeze([@LINK_NAMES@]);
+export const capacity = @CAPACITY@;
+export const Kind = Object.freeze({ NOTHING: -1, @KINDS_JS@ });
+// The robot's shapes, in the order of Solver.shapes.
+export const shapes = @SHAPES_JSON@;
+@}@
+
 export const Status = Object.freeze({
   BAD_INPUT: -2,
   INVALID: -1,
@@ -89,7 +97,92 @@ export class Solver {
     this._wasm.contacts();
     return { points: this._points.slice(), normals: this._normals.slice() };
   }
-@PALM_JS?@@SCENE_JS?@@FOLLOW_JS?@
+@PALM{@
+
+  touched(palm, posture) {
+    this._setPalm(palm, posture);
+    if (this._wasm.palm_contacts()) throw new RangeError("touched: the palm pose is not rigid, or a motor exceeds its limits");
+    return { points: this._points.slice(), normals: this._normals.slice() };
+  }
+
+  solvePalm(palm, posture, q0) {
+    this._setPalm(palm, posture);
+    if (q0) filled(this._q0, q0, "q0");
+    return this._answer(this._wasm.solve_palm(q0 ? 1 : 0));
+  }
+
+  _setPalm(palm, posture) {
+    filled(this._palm, palm, "palm");
+    filled(this._posture, posture, "posture");
+  }
+@}@
+@SCENE{@
+
+  setSolid(number, kind, size, pose, grasped = false) {
+    if (kind !== -1) {
+      const wasm = this._wasm;
+      const write = (address, values) =>
+        new Float64Array(wasm.memory.buffer, address, values.length).set(values);
+      if (pose.length !== 12) throw new RangeError(`pose: found ${pose.length} numbers, expected 12`);
+      write(wasm.size_at(), Array.from({ length: 3 }, (_, i) => size[i] ?? 0));
+      write(wasm.pose_at(), pose);
+    }
+    if (this._wasm.set_solid(number, kind, grasped ? 1 : 0)) {
+      throw new RangeError(`solid ${number} of kind ${kind} is invalid; expected a number from 0 to ${capacity - 1} and a Kind`);
+    }
+  }
+
+  setMargin(margin) {
+    this._wasm.set_margin(margin);
+  }
+
+  clearance(q) {
+    filled(this._q0, q, "q");
+    const clearance = this._wasm.clearance();
+    return { clearance, closest: this.closest() };
+  }
+
+  closest() {
+    if (!Number.isFinite(this._wasm.last_clearance())) return null;
+    const name = (index) => (index < 0 ? `solid ${-1 - index}` : links[index]);
+    return [name(this._wasm.closest(0)), name(this._wasm.closest(1))];
+  }
+
+  shapes(q) {
+    filled(this._q0, q, "q");
+    this._wasm.shapes();
+    return new Float64Array(this._wasm.memory.buffer, this._wasm.places_at(), @SHAPE_POSES@).slice();
+  }
+@}@
+@FOLLOW{@
+
+  followFrom(q0, { period = 0.01, velocity, acceleration } = {}) {
+    const wasm = this._wasm, count = motors.length;
+    const rates = new Float64Array(wasm.memory.buffer, wasm.rates_at(), 2 * count);
+    if (q0) filled(this._q0, q0, "q0");
+    if (velocity) filled(rates.subarray(0, count), velocity, "velocity");
+    if (acceleration) filled(rates.subarray(count), acceleration, "acceleration");
+    if (wasm.follow_from(q0 ? 1 : 0, period, velocity ? 1 : 0, acceleration ? 1 : 0)) {
+      throw new RangeError("followFrom: expected finite numbers, and period, velocity, acceleration > 0");
+    }
+  }
+
+  follow(points, normals, palm) {
+    const wasm = this._wasm, n = motors.length, f = fingers.length;
+    this._ask(points, normals);
+    if (palm) filled(this._palm, palm, "palm");
+    const status = wasm.follow(palm ? 1 : 0);
+    const results = new Float64Array(wasm.memory.buffer, wasm.followed_at(), 2 * (n + f));
+    return {
+      status,
+      q: results.slice(0, n),
+      velocity: results.slice(n, 2 * n),
+      positionError: results.slice(2 * n, 2 * n + f),
+      angleError: results.slice(2 * n + f),
+    };
+  }
+@}@
+
   _ask(points, normals, q0) {
     filled(this._points, points, "points");
     filled(this._normals, normals, "normals");
