@@ -5,11 +5,13 @@ from __future__ import annotations
 import ctypes
 import os
 import re
+import shutil
 import sys
 import warnings
 import zipfile
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -284,3 +286,26 @@ def test_a_long_compilation_is_announced(directory, monkeypatch, terminal, waits
     expected = size > 1000 and (terminal or not waits)
     announcement = r"compiling named \(about 5 s, once per machine\)\s*"
     assert re.fullmatch(announcement if expected else "", output)
+
+
+@pytest.mark.parametrize("options", ["", " -pipe"])
+def test_a_path_with_a_blank_has_to_be_quoted(
+    options: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler_path = shutil.which("cc") or shutil.which("gcc")
+    if compiler_path is None:
+        pytest.skip("needs a C compiler")
+    program = tmp_path / "my tools" / "cc"
+    program.parent.mkdir()
+    program.symlink_to(compiler_path)
+    forget(monkeypatch)
+    monkeypatch.setenv("CC", f"{program}{options}")
+    assert compiler.find_compiler() is None
+    with pytest.warns(compiler.NoCompilerWarning) as caught:
+        compiler.warn_no_compiler()
+    advice = str(caught[0].message)
+    # The advice of the message works.
+    quoted = advice.partition('CC="')[2].partition('"')[0]
+    assert str(program) in quoted
+    monkeypatch.setitem(os.environ, "CC", f"{quoted}{options}")
+    assert compiler.find_compiler() is not None

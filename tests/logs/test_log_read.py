@@ -474,3 +474,17 @@ def test_shards_that_contradict_are_refused(write: Write, tmp_path: Path) -> Non
         assert str(shard) in str(caught.value)
         assert str(first) in str(caught.value)
     assert sorted(tmp_path.iterdir()) == files_before
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("Asked", "LoggedTarget"),
+        ("OneSolve", "SolveRecord"),
+        ("matched", "match_targets"),
+        ("side_by_side", "compare_solves"),
+    ],
+)
+def test_deprecated_names_warn(old: str, new: str) -> None:
+    with pytest.warns(DeprecationWarning, match=new):
+        assert getattr(logs, old) is getattr(logs, new)

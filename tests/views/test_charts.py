@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import python
 
 import casadi_ik as ik
 from casadi_ik import errors, logs
@@ -153,3 +155,13 @@ def test_a_threshold_that_was_passed_is_a_line_with_a_name(long_log):
         r for r in long_log.events(event="NEAR_SINGULAR").records() if r["jacobian"] == "arm"
     ][:1]
     assert set(named["arm: near singular"].get_ydata()) == {event["threshold"]}
+
+
+@pytest.mark.parametrize("backend", ["not_installed", "module://not_installed", "agg", ""])
+def test_an_inherited_backend(backend: str, tmp_path: Path, log: ik.logs.Log) -> None:
+    """Pictures in files are independent of the backend of matplotlib in the environment."""
+    picture = tmp_path / "cup.png"
+    words = "-m", "casadi_ik", "log", "plot", log.shards[0].path, "--out", picture
+    done = python(*words, env={"MPLBACKEND": backend})
+    assert (done.returncode, done.stderr) == (0, "")
+    assert picture.read_bytes().startswith(b"\x89PNG")

@@ -1,4 +1,4 @@
-"""The check of links of the built site reports dead links."""
+"""Checks of the built site: dead links, unrendered markup, and formulas."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from processes import python
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 
 from building.links import broken, unread
+from building.mathml import mathml
 
 SCRIPT = Path(__file__).parents[2] / "docs" / "building" / "links.py"
 
@@ -46,3 +47,16 @@ def test_script_exits_with_its_findings(tmp_path: Path) -> None:
     done = python(SCRIPT, tmp_path)
     assert done.returncode == 1
     assert "gone.html" in done.stderr
+
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+
+
+def flat(tex: str) -> str:
+    return "".join(mathml(tex, display=True).split())
+
+
+def test_index_is_placed_beside_an_accented_letter() -> None:
+    rendered = flat(r"\dot q_t")
+    assert "<msub><moveraccent" in rendered
+    assert "munderover" not in rendered
