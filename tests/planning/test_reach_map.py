@@ -1,10 +1,13 @@
 """Reachability maps: verdicts, files, and input that is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from commands import main
 
 import casadi_ik as ik
+from casadi_ik.planning.reach.check import JointChain, pose_frames
 from casadi_ik.planning.reach.reach_map import ReachMap
 
 BOX = ([-0.9, -0.9, -0.2], [0.9, 0.9, 1.0])
@@ -37,6 +40,34 @@ def test_palm_poses_are_decided_like_cells(solver, reach):
     assert listed.q is None
     assert listed.shape == ()
     assert np.array_equal(listed.status[:, 0], reach.status[::7].ravel())
+
+
+def test_verdicts_are_confirmed_independently_and_wrong_ones_are_rejected(solver, reach):
+    check = reach.check(solver, 4)
+    assert sorted(set(check.status)) == ["REACHABLE", "UNREACHABLE"]
+    assert check.is_confirmed.all()
+    assert np.array_equal(reach.status[tuple(check.cells.T)], check.status)
+    # Every verdict is falsified: REACHABLE becomes UNREACHABLE, and the other way round.
+    flipped = np.array([0, 2, 1], dtype=np.int8)[reach.code]
+    q = np.broadcast_to(reach.q[reach.code == 1][0], reach.q.shape)
+    forged = replace(reach, code=flipped, q=q).check(solver, 2, max_boxes=500)
+    assert len(forged.cells) == 4
+    assert not forged.is_confirmed.any()
+
+
+def test_a_check_never_excludes_the_configuration_of_a_palm_pose():
+    robot = ik.load_robot("kuka_lwr4")
+    chain = JointChain(robot.description)
+    configurations = robot.random(np.random.default_rng(0), 5)
+    for q, palm in zip(configurations, robot.palm(configurations), strict=True):
+        assert chain.is_reached(palm, q, 1e-10)
+        for width in (1e-6, 0.05, 0.6):
+            lower = np.maximum(q - width, chain.lower)[None]
+            upper = np.minimum(q + 2 * width, chain.upper)[None]
+            low, high, _ = chain.contract(lower, upper, pose_frames(palm, 1e-10))
+            assert (low <= q).all()
+            assert (q <= high).all()
+            assert len(low) == 1
 
 
 def test_threads_give_the_same_map(solver, reach):

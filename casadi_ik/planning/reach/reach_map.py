@@ -22,6 +22,7 @@ from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import describe_arm
 from casadi_ik.model.grasp import Tolerance
+from casadi_ik.planning.reach.check import MAX_BOXES, JointChain, MapCheck
 from casadi_ik.planning.reach.decide import (
     REACH_PARAMETERS,
     Meaning,
@@ -123,6 +124,54 @@ class ReachMap:
         """Return `layer_shares`; deprecated name."""
         warn_renamed("ReachMap.slice", "ReachMap.layer_shares")
         return self.layer_shares(axis, value)
+
+    def check(
+        self, solver: Any, count: int = 20, seed: int = 0, max_boxes: int = MAX_BOXES
+    ) -> MapCheck:
+        """Check random cells by code that the map was not computed with.
+
+        The check of an UNREACHABLE cell is a proof by another method, see
+        `casadi_ik.planning.reach.check`. REACHABLE cells are checked by the forward kinematics of
+        that module if the meaning is exact and the map has witnesses.
+
+        Args:
+            solver: Solver with the robot, the limits and the tolerances of the map.
+            count: Largest number of UNREACHABLE and of REACHABLE cells.
+            seed: Seed of the choice.
+            max_boxes: Number of boxes of joint positions after which an UNREACHABLE cell is not
+                confirmed.
+
+        Raises:
+            InputError: The map belongs to another robot.
+            UnsupportedError: The arm has a joint that is not revolute or has no motor.
+        """
+        robot = solver.robot
+        if robot.name != self.robot:
+            raise InputError(f"solver: robot is {robot.name!r}; expected {self.robot!r}")
+        chain = JointChain(robot.description, solver.limits == "enforce")
+        rng = np.random.default_rng(seed)
+        radius = rotation_radius = REACH_PARAMETERS.exact
+        if self.meaning != Meaning.EXACT:
+            tolerance = _palm_tolerance(solver)
+            radius += tolerance.position
+            rotation_radius += 2 * np.sin(min(tolerance.angle, np.pi) / 2)
+        unreachable = np.argwhere(self.code == Reachability.UNREACHABLE)
+        unreachable = unreachable[rng.permutation(len(unreachable))[:count]]
+        is_confirmed = [
+            chain.is_refuted(self.palms(row)[column], radius, rotation_radius, max_boxes)
+            for row, column in unreachable.tolist()
+        ]
+        reachable = np.argwhere(self.code == Reachability.REACHABLE)
+        reachable = reachable[rng.permutation(len(reachable))[:count]]
+        if self.q is None or self.meaning != Meaning.EXACT:
+            reachable = reachable[:0]
+        else:
+            is_confirmed += [
+                chain.is_reached(self.palms(row)[column], self.q[row, column], radius)
+                for row, column in reachable.tolist()
+            ]
+        cells = np.concatenate([unreachable, reachable])
+        return MapCheck(cells, self.status[tuple(cells.T)], np.array(is_confirmed, dtype=bool))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the map as .npz.
