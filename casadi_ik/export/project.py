@@ -393,13 +393,16 @@ def kernel_uses(
     if not everything:
         return
 
-    def diagnose_unreachable() -> object:
+    def solve_unreachable(diagnose: bool) -> object:
         points, normals = targets()
-        return solver.solve_batch(points[:1] + 100.0, normals[:1], diagnose=True)
+        return solver.solve_batch(
+            points[:1] + 100.0, normals[:1], diagnose=diagnose, best_effort=not diagnose
+        )
 
     yield "real-time loops", solver.fast
     yield "logs", solve_with_log
-    yield "diagnoses", diagnose_unreachable
+    yield "diagnoses", lambda: solve_unreachable(True)
+    yield "nearest configurations", lambda: solve_unreachable(False)
     yield "followers", lambda: solver.follow(q[0], period=0.001)(grasp())
     try:
         scene_solver = Solver(robot, scene=Scene())

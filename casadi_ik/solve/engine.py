@@ -62,7 +62,8 @@ class SolveOptions:
     best_effort: bool | str | BestEffort = False
 
     def __post_init__(self) -> None:
-        BestEffort.of(self.best_effort)
+        if self.best_effort is not False:
+            BestEffort.of(self.best_effort)
         if not isinstance(self.jobs, (int, np.integer)) or self.jobs < 1:
             raise InputError(f"jobs: found {self.jobs!r}, expected an integer >= 1")
         self.jobs = int(self.jobs)
@@ -73,8 +74,8 @@ class SolveOptions:
         Raises:
             UnknownNameError: The robot does not have a finger with weights.
         """
-        if (best_effort := BestEffort.of(self.best_effort)) is not None:
-            best_effort.check(robot.fingers)
+        if isinstance(self.best_effort, BestEffort):
+            self.best_effort.check(robot.fingers)
 
 
 REQUIRED_ARRAYS = ("points", "normals")
@@ -320,8 +321,8 @@ class Engine:
                 _ = engine.diagnostician
             if needs_finder and engine.hand_search is not None:
                 _ = engine.finder
-        trace_format = self.method.trace_format
-        if recorder is not None and trace_format.measures is not None:
+        trace_format = None if recorder is None else self.method.trace_format
+        if trace_format is not None and trace_format.measures is not None:
             trace_format.measures.prepare()
         batches = []
         with (
@@ -330,7 +331,7 @@ class Engine:
         ):
             for part in self._parts(targets, options, outcome):
                 report_progress(len(part.batch))
-                if recorder is not None:
+                if recorder is not None and trace_format is not None:
                     background.do(partial(part.record, recorder, trace_format))
                 batches.append(part.batch)
         return BatchSolution.joined(batches)
