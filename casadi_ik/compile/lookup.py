@@ -31,7 +31,7 @@ CHUNK = 256
 """Number of samples that NumPy compares at once, so that they fit into the cache."""
 
 
-_Job = c_struct("lookup_job", driver="jobs")
+LookupJob = c_struct("lookup_job", driver="jobs")
 
 
 class LookupKernel:
@@ -105,19 +105,10 @@ class LookupKernel:
     def _run_compiled(
         self, arrays: list[NDArray[np.float64]], steps: list[int], rows: NDArray[np.int64]
     ) -> None:
-        job, _buffers = self._job(arrays, rows, steps)
-        run_cancellable(self.key.name, self.entry, job)
-
-    def _job(
-        self,
-        inputs: Sequence[NDArray[np.float64]],
-        rows: NDArray[np.int64],
-        steps: Sequence[int] = (),
-    ) -> tuple[Any, Any]:
-        """Return a job, and buffers that must stay alive with it."""
-        sources = (ctypes.c_void_p * len(inputs))(*map(memory, inputs))
-        strides = (ctypes.c_int64 * len(inputs))(*steps)
-        job = _Job(
+        # The arrays of addresses must stay alive with the job.
+        sources = (ctypes.c_void_p * len(arrays))(*map(memory, arrays))
+        strides = (ctypes.c_int64 * len(arrays))(*steps)
+        job = LookupJob(
             inputs=ctypes.addressof(sources),
             input_steps=ctypes.addressof(strides),
             tiles=memory(self.tiles),
@@ -127,7 +118,7 @@ class LookupKernel:
             count=len(rows),
             slice=SLICE,
         )
-        return job, (sources, strides)
+        run_cancellable(self.key.name, self.entry, job)
 
     def _run_numpy(self, arrays: list[NDArray[np.float64]], rows: NDArray[np.int64]) -> None:
         (keys,) = self.key(*arrays)
