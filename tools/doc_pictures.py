@@ -5,6 +5,7 @@
 
 The pictures show the frames of a contact, an obstacle with and without a scene, eight arm-hands, an
 unreachable grasp, a humanoid that holds a box, and all built-in arms, hands and multi-arm robots.
+Robots have visual meshes if the package `example-robot-data` is installed.
 """
 
 from __future__ import annotations
@@ -322,7 +323,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     options = parser.parse_args(arguments)
     for name in options.only:
-        file = options.out / f"{name}.png"
+        file = options.out / ("gallery" if name in GALLERIES else "") / f"{name}.png"
         pictures[name](file)
         print(file, file.stat().st_size)
 

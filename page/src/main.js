@@ -101,7 +101,9 @@ async function selectRobot(robot, question = null, hash = "") {
     }
   }
   const { grasps } = solving.robot.about;
-  question ??= shippedQuestion(grasps[Math.max(grasps.findIndex(isFree), 0)]);
+  // A cup is the clearest example; robots without one begin with a grasp that collides with nothing.
+  const cup = grasps.find((grasp) => grasp.object === "cup" && isFree(grasp));
+  question ??= shippedQuestion(cup ?? grasps[Math.max(grasps.findIndex(isFree), 0)]);
   showQuestion(question);
   fitView();
   if (!question.kept || first) record();

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import urllib.request
 from pathlib import Path
 
 import numpy as np
@@ -60,3 +61,11 @@ def test_unstated_pads_are_refused(tmp_path: Path) -> None:
     other_file.write_text("name: other\nhand: barrett_bh8_280\nfingers: [thumb]\n")
     with pytest.raises(errors.DescriptionError, match=r"other\.yaml: fingers: expected"):
         viewing.view_pads(other_file)
+
+
+def test_page_follows_the_theme_of_the_first_browser(pads: viewing.Viewer) -> None:
+    assert not pads.page.dark
+    for theme in ("dark", "light"):  # a second browser does not change the page
+        with urllib.request.urlopen(f"{pads.url}theme/{theme}") as response:
+            assert response.status == 200
+        assert pads.page.dark

@@ -56,7 +56,7 @@ def view_grasp(
     candidates: Candidates | None = None,
     host: str = HOST,
     port: int | None = None,
-    dark: bool = False,
+    dark: bool | None = None,
 ) -> Viewer:
     """Open a page on which contacts, the object and obstacles can be dragged.
 
@@ -70,7 +70,7 @@ def view_grasp(
         candidates: Candidate grasps by name, offered in a list.
         host: Address at which the page is served; "0.0.0.0": reachable from the network.
         port: Port; None: the first free one from 8080 on.
-        dark: Use the dark theme initially.
+        dark: Use the dark theme initially; None: follow the first browser that opens the page.
 
     Raises:
         InputError: The grasp names an unknown finger, or the port is in use.
@@ -91,7 +91,7 @@ def view_found(
     scene: Scene | None = None,
     host: str = HOST,
     port: int | None = None,
-    dark: bool = False,
+    dark: bool | None = None,
 ) -> Viewer:
     """Open a page with the grasps of `Solver.grasps_of`, with filters.
 
@@ -130,7 +130,7 @@ def view_log(
     scene: Scene | None = None,
     host: str = HOST,
     port: int | None = None,
-    dark: bool = False,
+    dark: bool | None = None,
 ) -> Viewer:
     """Open a page that plays one logged solve, or two next to each other.
 
@@ -161,7 +161,7 @@ def view_motion(
     label: str = "",
     host: str = HOST,
     port: int | None = None,
-    dark: bool = False,
+    dark: bool | None = None,
 ) -> Viewer:
     """Open a page that plays a motion, with charts of positions and velocities.
 

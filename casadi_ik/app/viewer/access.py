@@ -68,11 +68,14 @@ class Access:
         host: Address at which the page is served.
         token: First component of the path of every request; "": no token is required.
         title: Title of the browser's tab.
+        on_dark_theme: Function that receives whether the first browser prefers dark pages; None if
+            the theme is set.
     """
 
     host: str
     token: str = ""
     title: str = "casadi_ik"
+    on_dark_theme: Callable[[bool], None] | None = None
 
     def refusal(self, request: Request) -> str:
         """Return the reason why a request is refused; "" if it is allowed."""
@@ -144,6 +147,11 @@ def _checking(access: Access, process: Any) -> Any:
         if refusal:
             return connection.respond(HTTPStatus.FORBIDDEN, f"{refusal}\n")
         path = request.path.removeprefix(f"/{access.token}") if access.token else request.path
+        if path in (f"{THEME_PATH}dark", f"{THEME_PATH}light"):
+            callback, access.on_dark_theme = access.on_dark_theme, None
+            if callback is not None:
+                callback(path == f"{THEME_PATH}dark")
+            return connection.respond(HTTPStatus.OK, "")
         if path.split("?")[0] not in ("", "/"):
             return process(connection, Request(path, request.headers))
         # The body is changed below, so it must not be compressed.
@@ -155,22 +163,27 @@ def _checking(access: Access, process: Any) -> Any:
     return process_request
 
 
-BROWSER_NOTICE = """<noscript>This page needs JavaScript.</noscript><script>
+THEME_PATH = "/theme/"
+"""Path below which a browser reports whether it prefers dark pages."""
+
+HEAD_SCRIPT = """<noscript>This page needs JavaScript.</noscript><script>
 if (!document.createElement("canvas").getContext("webgl2")) document.addEventListener(
   "DOMContentLoaded", () => document.body.insertAdjacentHTML("afterbegin",
   "<p role='alert' style='position:fixed;z-index:9999;margin:1em;padding:1em;background:#fff3cd;"
   + "color:#333;border-radius:0.4em'>This page needs WebGL 2: enable hardware acceleration in the "
   + "settings of the browser, or use another browser.</p>"));
+fetch(location.pathname.replace(/\\/?$/, "/theme/")
+  + (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
 </script></head>"""
-"""Notice in browsers without JavaScript or WebGL 2."""
+"""Notice in browsers without JavaScript or WebGL 2, and the report of the preferred theme."""
 
 
 def _set_page_title(page: Response | None, title: str) -> Response | None:
-    """Set the title of the browser's tab, and add the notice for unsupported browsers."""
+    """Set the title of the browser's tab, and add `HEAD_SCRIPT`."""
     if page is not None:
         title_tag = f"<title>{html.escape(title)} · casadi_ik</title>"
         page.body = page.body.replace(b"<title>Viser</title>", title_tag.encode())
-        page.body = page.body.replace(b"</head>", BROWSER_NOTICE.encode(), 1)
+        page.body = page.body.replace(b"</head>", HEAD_SCRIPT.encode(), 1)
         del page.headers["Content-Length"]
         page.headers["Content-Length"] = str(len(page.body))
     return page

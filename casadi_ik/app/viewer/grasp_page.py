@@ -116,7 +116,7 @@ class GraspPage(InteractivePage):
         q: Array,
         candidates: Candidates | None = None,
         solve_first: bool = True,
-        dark: bool = False,
+        dark: bool | None = None,
     ) -> None:
         """Solve the request, draw everything and start the worker thread.
 
@@ -127,7 +127,7 @@ class GraspPage(InteractivePage):
             q: (n,) Initial configuration [rad or m].
             candidates: Candidate grasps by name.
             solve_first: True to solve the initial request; False to check and show q.
-            dark: True for the dark theme.
+            dark: Use the dark theme; None: follow the browser.
         """
         self._request_solver = RequestSolver(robot)
         evaluate = self._request_solver.solve if solve_first else self._request_solver.check

@@ -70,7 +70,7 @@ class PadPage(InteractivePage):
         path: Path,
         surfaces: Mapping[str, IndexedMesh],
         writable: bool = True,
-        dark: bool = False,
+        dark: bool | None = None,
     ) -> None:
         """Draw the hand and its pads.
 
@@ -80,7 +80,7 @@ class PadPage(InteractivePage):
             path: Path of the description.
             surfaces: Meshes of the robot's files by link.
             writable: Allow users of the page to save.
-            dark: Use the dark theme.
+            dark: Use the dark theme; None: follow the browser.
         """
         drawables = [drawable for drawable in visual_bodies(robot) if drawable.role != "pad"]
         request = request_of(robot, None, None)

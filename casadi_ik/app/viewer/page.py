@@ -51,18 +51,20 @@ class Page:
 
     on_replaced: Callable[[Page], None]
 
-    def __init__(self, server: Server, title: str, floor: float, dark: bool) -> None:
+    def __init__(self, server: Server, title: str, floor: float, dark: bool | None) -> None:
         """Replace the content of the server by an empty page.
 
         Args:
             server: Server of the page.
             title: Title of the panel and of the browser's tab.
             floor: Height of the ground [m].
-            dark: Use the dark theme.
+            dark: Use the dark theme; None: follow the first browser that opens the page.
         """
-        self.server, self.dark, self.is_stopped = server, dark, False
+        self.server, self.dark, self.is_stopped = server, bool(dark), False
         self._title_and_floor = title, floor
-        set_up_scene(server, title, floor, dark)
+        self._theme_box: Any = None
+        server.access.on_dark_theme = self.set_theme if dark is None else None
+        set_up_scene(server, title, floor, self.dark)
 
     def start(self, *idle_tasks: tuple[float, Task]) -> None:
         """Start the worker thread; for `idle_tasks` see `LatestOnly`."""
@@ -82,15 +84,22 @@ class Page:
     def select(self, name: str) -> None:
         """Show the handles of an item, on pages that have handles."""
 
+    def set_theme(self, dark: bool) -> None:
+        """Use the dark or the light theme."""
+        self.dark, self.server.access.on_dark_theme = dark, None
+        set_up_scene(self.server, *self._title_and_floor, dark)
+        if self._theme_box is not None and self._theme_box.value != dark:
+            self._theme_box.value = dark
+
     def add_theme_switch(self) -> None:
         """Add a switch between the light and the dark theme."""
-        title, floor = self._title_and_floor
         box = self.server.gui.add_checkbox("Dark", self.dark)
+        self._theme_box = box
 
         @box.on_update
         async def _(_: Any) -> None:
-            self.dark = box.value
-            set_up_scene(self.server, title, floor, box.value)
+            if box.value != self.dark:
+                self.set_theme(box.value)
 
 
 class InteractivePage(Page):
@@ -109,7 +118,7 @@ class InteractivePage(Page):
         request: PageRequest,
         title: str,
         floor: float,
-        dark: bool,
+        dark: bool | None,
     ) -> None:
         """Make an empty page, see `Page`."""
         super().__init__(server, title, floor, dark)

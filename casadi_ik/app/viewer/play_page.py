@@ -299,7 +299,7 @@ class PlayPage(Page):
         server: Server,
         playbacks: Sequence[Playback],
         scene: Scene | None = None,
-        dark: bool = False,
+        dark: bool | None = None,
     ) -> None:
         """Draw everything and start the threads.
 
@@ -307,7 +307,7 @@ class PlayPage(Page):
             server: Server of the page.
             playbacks: One or two playbacks.
             scene: Obstacles that are drawn around each robot; None: none.
-            dark: Use the dark theme.
+            dark: Use the dark theme; None: follow the browser.
         """
         super().__init__(server, _title(playbacks), ground_height(playbacks[0].robot, scene), dark)
         self.playbacks, self.time_shown, self._scene = tuple(playbacks), 0.0, scene
