@@ -251,7 +251,7 @@ class Solver(MovingSolver):
         prefer: str | None = None,
         object_pose: ArrayLike | None = None,
         best_effort: bool | str | BestEffort = False,
-        **more: ArrayLike | None,
+        **extra_vectors: ArrayLike | None,
     ) -> BatchSolution:
         """Solve k targets.
 
@@ -271,10 +271,10 @@ class Solver(MovingSolver):
             prefer: See `solve`.
             object_pose: (4, 4) or (k, 4, 4) pose of the grasped item of the scene, base frame.
             best_effort: See `solve`.
-            more: (k, f, 3) further vectors by name, NaN where free: "tangents" (second axes of
-                `ArmHand.contact_frames`), "lines" and "planes" (the point may lie anywhere on
-                them), "balls" (outward normals of ball pads that touch the points), "directions"
-                (directions of fingertips without a point).
+            extra_vectors: (k, f, 3) further vectors by name, NaN where free: "tangents" (second
+                axes of `ArmHand.contact_frames`), "lines" and "planes" (the point may lie anywhere
+                on them), "balls" (outward normals of ball pads that touch the points),
+                "directions" (directions of fingertips without a point).
 
         Returns:
             The fields of a `Solution`, as arrays.
@@ -289,7 +289,7 @@ class Solver(MovingSolver):
             ((1000, 14), True)
         """
         targets = self._target_builder.from_arrays(
-            points, normals, more, fixed=fixed, q0=q0, prefer=prefer, seed=seed
+            points, normals, extra_vectors, fixed=fixed, q0=q0, prefer=prefer, seed=seed
         )
         if object_pose is not None:
             targets = targets.holding(grasped_in(self.scene), object_pose)
@@ -498,7 +498,7 @@ class Solver(MovingSolver):
         points: ArrayLike,
         normals: ArrayLike,
         gradient: ArrayLike | None = None,
-        **more: ArrayLike | None,
+        **extra_vectors: ArrayLike | None,
     ) -> Sensitivity:
         """Return the derivatives of solutions by their targets (implicit function theorem).
 
@@ -511,7 +511,7 @@ class Solver(MovingSolver):
             normals: (k, f, 3) pad normals.
             gradient: (k, n) gradient of a scalar by q [1/rad or 1/m]: the result is its gradient
                 by the contacts, which is cheaper. None: the derivatives of q.
-            more: See `solve_batch`.
+            extra_vectors: See `solve_batch`.
 
         Returns:
             Derivatives (k, n, f, 3) of q by points [rad/m or 1] and by normals [rad or m]; with a
@@ -527,7 +527,7 @@ class Solver(MovingSolver):
             (1, 14, 3, 3)
         """
         configurations = self.robot.configuration(q)
-        targets = self._target_builder.from_arrays(points, normals, more)
+        targets = self._target_builder.from_arrays(points, normals, extra_vectors)
         k, n = len(targets), len(self.robot.actuators)
         if configurations.shape != (k, n):
             raise InputError(f"q: found shape {configurations.shape}, expected {(k, n)}")

@@ -159,7 +159,7 @@ def _stored_verdicts(
                 if verdict is None
                 else ", ".join(
                     [
-                        *(f"{item.part} {item.finger}" for item in verdict.freed),
+                        *(f"{item.part} {item.finger}" for item in verdict.released),
                         *(item.lifted for item in verdict.reliefs),
                     ]
                 )

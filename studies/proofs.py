@@ -167,7 +167,7 @@ def clearly_impossible(part: Part) -> dict[str, Any]:
     for row, proof in zip(rows, proofs, strict=True):
         diagnosis = batch.diagnoses[row]
         if proof is None:
-            fits = diagnosis is not None and diagnosis.hand is not None and diagnosis.hand.fits
+            fits = diagnosis is not None and diagnosis.hand is not None and diagnosis.hand.ok
             results["arm" if fits else "hand"] += 1
     proved = [i for i, proof in enumerate(proofs) if proof is not None]
     if proved:

@@ -104,7 +104,7 @@ class MultiArmSceneSources(SceneSources):
         integers = {
             "STATE_FIRST_CANDIDATE": state.slice("first_candidate").start,
             "STATE_PALMS": state.slice("palm_rotation_0").start,
-            "STATE_HAND_FITS": state.slice("hand_fits").start,
+            "STATE_MEETS_CONTACTS": state.slice("meets_contacts").start,
             "STATE_ARM_MARGIN": state.slice("arm_margin").start,
             "PARAMETERS_PALMS_ONLY": parameters.slice("palms_only").start,
             "N_TRUNK_AND_ARMS": len(motors),

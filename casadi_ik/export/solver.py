@@ -48,7 +48,7 @@ from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.search_code import SearchPlan, source_text
-from casadi_ik.solve.hand_first.state import terms
+from casadi_ik.solve.hand_first.state import settings_layout
 from casadi_ik.solve.hand_postures import POSTURE_LIMIT_SLACK
 from casadi_ik.solve.target_builder import contacts_from_palms
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
@@ -426,7 +426,7 @@ class SolverSources:
                 self.plan.source + "".join(substitutes.values()), *single_constants
             ),
             "SEARCH": self.plan.source,
-            "TERMS": define_arrays({"TERMS": self._terms(), "HOME": robot.home}),
+            "SETTINGS": define_arrays({"SETTINGS": self._settings(), "HOME": robot.home}),
             "LIMITS": define_arrays(
                 {f"{self.prefix}_lower": lower, f"{self.prefix}_upper": upper}, "const"
             ),
@@ -464,22 +464,20 @@ class SolverSources:
     def _bounds(self) -> tuple[Array, Array]:
         return (self.robot.lower, self.robot.upper) if self.single is None else self.single.bounds
 
-    def _terms(self) -> Array:
+    def _settings(self) -> Array:
         f = len(self.robot.fingers)
         no_contacts, tolerance = np.zeros((1, f, 3)), self.tolerance
-        layout = terms(self.robot.description)
+        layout = settings_layout(self.robot.description)
         if self.single is not None:
             reduction = self.single.tolerance
             tolerance = Tolerance(
                 tolerance.position - reduction.position, tolerance.angle - reduction.angle
             )
-        terms_of_target = self.method.terms(
+        settings = self.method.settings(
             TargetBatch(no_contacts, no_contacts, tolerance, True)
         ).copy()
-        terms_of_target[layout.slice("lower")], terms_of_target[layout.slice("upper")] = (
-            self._bounds
-        )
-        return terms_of_target
+        settings[layout.slice("lower")], settings[layout.slice("upper")] = self._bounds
+        return settings
 
     def judge(self) -> dict[str, str]:
         """Return the files of double-precision kinematics that verify solutions."""

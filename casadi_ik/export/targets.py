@@ -128,7 +128,7 @@ def _answers(
     for row in range(len(points)):
         q0 = None if starts is None else starts[row]
         target = builder.from_arrays(points[row : row + 1], normals[row : row + 1], q0=q0)
-        search.set_target(target, 0, method.terms(target))
+        search.set_target(target, 0, method.settings(target))
         answer = search.result(search(method.rounds) or 0)
         yield answer.q, answer.status, answer.iterations, answer.restarts
 

@@ -25,7 +25,7 @@ from casadi_ik.motion.motion import direction_vector, length, rates_of, seconds,
 from casadi_ik.motion.reach import CarriedObject, Pace, Reach, ReachPlan, move, place, reach
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.solve.engine import Engine, SolveOptions
-from casadi_ik.solve.solution import Chosen
+from casadi_ik.solve.solution import SolvedGrasp
 from casadi_ik.solve.target_builder import TargetBuilder
 from casadi_ik.solve.verdict import LIMIT_SLACK, judge
 
@@ -163,7 +163,7 @@ class MovingSolver:
 
     def reach(
         self,
-        grasp: Grasp | Chosen,
+        grasp: Grasp | SolvedGrasp,
         q0: ArrayLike | None = None,
         opening: float = 0.02,
         distance: float = 0.08,
@@ -231,7 +231,7 @@ class MovingSolver:
 
     def place(
         self,
-        held: Chosen,
+        held: SolvedGrasp,
         pose: ArrayLike,
         q0: ArrayLike,
         lower: float = 0.05,
@@ -368,7 +368,7 @@ class MovingSolver:
 
     def approach(
         self,
-        grasp: Grasp | Chosen,
+        grasp: Grasp | SolvedGrasp,
         distance: float = 0.08,
         opening: float = 0.02,
         q0: ArrayLike | None = None,
@@ -412,7 +412,7 @@ class MovingSolver:
 
     def _approach_plan(
         self,
-        grasp: Grasp | Chosen,
+        grasp: Grasp | SolvedGrasp,
         start: Array,
         opening: float,
         distance: float,
@@ -432,7 +432,7 @@ class MovingSolver:
         )
 
     def _solutions(
-        self, grasp: Grasp | Chosen, problem: TargetBatch, start: Array, seed: int, limit: int
+        self, grasp: Grasp | SolvedGrasp, problem: TargetBatch, start: Array, seed: int, limit: int
     ) -> tuple[list[Array], str]:
         """Return the solutions (n,) of a grasp, nearest first, and the reason if there are none.
 

@@ -262,7 +262,7 @@ class FloatingPalmFit:
             row_errors = (array[row].tolist() for array in errors)
             contacts = contact_verdicts(fingers, targets.tolerances, *row_errors)
             hand, arm = HandFit(bool(hand_fits.ok[row]), contacts), None
-            if hand.fits and self._arm is not None:
+            if hand.ok and self._arm is not None:
                 arm = ArmReach(
                     float(hand_fits.distance[nearest_row]), *self._wrist_range(targets, self._arm)
                 )

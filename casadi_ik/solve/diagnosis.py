@@ -10,6 +10,7 @@ from functools import cached_property
 
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.lazy_import import ReprMixin
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.model.targets import Tolerance
 from casadi_ik.solve.proofs.proof import Proof
 from casadi_ik.solve.verdict import ContactVerdict, PalmVerdict
@@ -48,12 +49,18 @@ class HandFit:
     """Fit of the hand alone, with a floating palm, to the contacts.
 
     Attributes:
-        fits: True if every contact is within tolerance.
+        ok: True if every contact is within tolerance.
         contacts: Errors by finger.
     """
 
-    fits: bool
+    ok: bool
     contacts: Mapping[str, ContactVerdict]
+
+    @property
+    def fits(self) -> bool:
+        """Deprecated name of `ok`."""
+        warn_renamed("HandFit.fits", "HandFit.ok")
+        return self.ok
 
 
 @dataclass(frozen=True)
@@ -83,20 +90,26 @@ class Relief:
 
     Attributes:
         lifted: Name of an actuator, or "arm", "hand" or "all" for all limits of these.
-        beyond: Limit violation of the solution by actuator [rad or m]: > 0 above the upper limit,
-            < 0 below the lower limit. It is the smallest violation that was found.
+        violations: Limit violation of the solution by actuator [rad or m]: > 0 above the upper
+            limit, < 0 below the lower limit. It is the smallest violation that was found.
         units: Unit by actuator.
         q: (n,) solution [rad or m].
     """
 
     lifted: str
-    beyond: Mapping[str, float]
+    violations: Mapping[str, float]
     units: Mapping[str, str]
     q: Array
 
+    @property
+    def beyond(self) -> Mapping[str, float]:
+        """Deprecated name of `violations`."""
+        warn_renamed("Relief.beyond", "Relief.violations")
+        return self.violations
+
 
 @dataclass(frozen=True)
-class Freed:
+class ReleasedContact:
     """A contact or normal whose release makes the grasp solvable, with a solution as evidence.
 
     Attributes:
@@ -133,11 +146,11 @@ class Remedies:
 
     Attributes:
         reliefs: Limits whose removal makes it solvable.
-        freed: Fingers and normals whose release makes it solvable.
+        released: Fingers and normals whose release makes it solvable.
     """
 
     reliefs: tuple[Relief, ...] = ()
-    freed: tuple[Freed, ...] = ()
+    released: tuple[ReleasedContact, ...] = ()
 
 
 class LazyRemedies:
@@ -160,8 +173,8 @@ class LazyRemedies:
 class Diagnosis(ReprMixin):
     """Cause of an unsolved grasp, with evidence.
 
-    The remedies (`reliefs`, `freed`, and their part of `lines`) are computed on first access, which
-    takes some milliseconds.
+    The remedies (`reliefs`, `released`, and their part of `lines`) are computed on first access,
+    which takes some milliseconds.
 
     Attributes:
         reason: The proved cause; without a proof the likely one.
@@ -182,7 +195,7 @@ class Diagnosis(ReprMixin):
             and the trunk alone; empty for a single arm.
 
     Example:
-        >>> far.status.name, far.diagnosis.reason.name, far.diagnosis.hand.fits
+        >>> far.status.name, far.diagnosis.reason.name, far.diagnosis.hand.ok
         ('UNREACHABLE', 'REACH', True)
         >>> print(far.diagnosis.lines[0])  # doctest: +ELLIPSIS
         the hand fits the contacts, but the arm does not reach there...
@@ -216,9 +229,15 @@ class Diagnosis(ReprMixin):
         return self.lazy.remedies.reliefs
 
     @property
-    def freed(self) -> tuple[Freed, ...]:
+    def released(self) -> tuple[ReleasedContact, ...]:
         """Fingers and normals whose release makes the grasp solvable."""
-        return self.lazy.remedies.freed
+        return self.lazy.remedies.released
+
+    @property
+    def freed(self) -> tuple[ReleasedContact, ...]:
+        """Deprecated name of `released`."""
+        warn_renamed("Diagnosis.freed", "Diagnosis.released")
+        return self.released
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -231,14 +250,14 @@ class Diagnosis(ReprMixin):
         for relief in self._smallest_reliefs:
             violations = ", ".join(
                 f"{name} {_length(value, relief.units[name])} {_violated_side(value)}"
-                for name, value in relief.beyond.items()
+                for name, value in relief.violations.items()
             )
             lines.append(f"solvable with limits lifted: {violations}")
         if self.palm is not None:
             error = _format_error(self.palm.position_error, self.palm.angle_error)
             return (*lines, f"nearest: the palm is {error} off")
-        fingers = [item.finger for item in self.freed if item.part == "finger"]
-        normals = [item.finger for item in self.freed if item.part == "normal"]
+        fingers = [item.finger for item in self.released if item.part == "finger"]
+        normals = [item.finger for item in self.released if item.part == "normal"]
         all_normals = normals == ["all"]
         normals = [name for name in normals if name != "all"]
         if fingers:
@@ -275,7 +294,7 @@ class Diagnosis(ReprMixin):
         ]
         if len(self.sides) > 1 and not lines:
             lines.append(f"{' and '.join(self.sides)} are solvable separately, but not together")
-        if self.hand is not None and not self.hand.fits:
+        if self.hand is not None and not self.hand.ok:
             errors = [
                 f"{name} {_format_error(verdict.position_error, verdict.angle_error)} off"
                 for name, verdict in self.hand.contacts.items()

@@ -364,7 +364,7 @@ class _Clock:
 
 def _cause_of(hand: HandFit | None, reach: ArmReach | None, proof: Proof | None) -> Reason | None:
     # A proof by reach excludes every posture of hand and arm; the arm need not be the cause.
-    if (proof is not None and proof.kind is not ProofKind.REACH) or (hand and not hand.fits):
+    if (proof is not None and proof.kind is not ProofKind.REACH) or (hand and not hand.ok):
         return Reason.HAND
     if proof is not None:
         return Reason.REACH

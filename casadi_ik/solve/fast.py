@@ -58,12 +58,12 @@ class FastSolver:
         if search is None:
             return
         self._points, self._normals, self._start = search.points, search.normals, search.q0
-        self._parameters, self._q = search.terms, search.q
+        self._parameters, self._q = search.settings, search.q
         self._max_restarts = method.rounds
         self.position_error, self.angle_error = search.position_error, search.angle_error
         # Tolerances and limits are the same for all targets.
         any_contact = np.zeros((1, *self._shapes[0])), np.ones((1, *self._shapes[0]))
-        self._parameters[...] = method.terms(target_builder.from_arrays(*any_contact))
+        self._parameters[...] = method.settings(target_builder.from_arrays(*any_contact))
 
     def __call__(
         self, points: ArrayLike, normals: ArrayLike, q0: ArrayLike | None = None

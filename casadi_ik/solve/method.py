@@ -291,7 +291,7 @@ class SingleSearch(Protocol):
         points: (f, 3) contact points [m], NaN where free; an input.
         normals: (f, 3) pad normals, NaN where free; an input.
         q0: (n,) start configuration [rad or m]; an input.
-        terms: Parameters that targets share, as `HandSearch.terms` returns them; an input.
+        settings: Settings that targets share, as `HandSearch.settings` returns them; an input.
         q: (n,) result [rad or m]; overwritten by each call, like the errors.
         position_error: (f,) distances [m].
         angle_error: (f,) angles [rad].
@@ -300,7 +300,7 @@ class SingleSearch(Protocol):
     points: Array
     normals: Array
     q0: Array
-    terms: Array
+    settings: Array
     q: Array
     position_error: Array
     angle_error: Array
@@ -357,8 +357,8 @@ class HandSearch(Method, Protocol):
         """Return memory for successive searches; None without a compiler."""
         ...
 
-    def terms(self, targets: TargetBatch) -> Array:
-        """Return the parameters that targets share: tolerances, bounds, preference."""
+    def settings(self, targets: TargetBatch) -> Array:
+        """Return the settings that targets share: tolerances, bounds, preference."""
         ...
 
     def postures(self, targets: TargetBatch, number: int) -> Array:

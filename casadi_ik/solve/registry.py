@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 
 from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.hand_first.method import HandFirstMethod
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
@@ -55,6 +56,13 @@ _ENTRIES: dict[str, _Entry] = {
     ),
 }
 """Methods by name; `casadi_ik.papers` and `register_method` add more."""
+
+RENAMED_OPTIONS = {
+    "as_it_is": "max_cost_of_q0",
+    "eased": "damping_decrease",
+    "tightened": "damping_increase",
+}
+"""Deprecated name -> name of options of shipped methods; both work until version 0.3."""
 
 _SHIPPED = set(_ENTRIES)
 """Names of shipped methods, which cannot be replaced."""
@@ -185,7 +193,11 @@ def build_method(
         InputError: An option has an invalid value.
         UnsupportedError: The method does not support the robot.
     """
-    entry = _entry(name)
+    entry, options = _entry(name), dict(options)
+    for old, new in RENAMED_OPTIONS.items():
+        if old in options and old not in entry.options and new in entry.options:
+            warn_renamed(f"option {old}", new)
+            options[new] = options.pop(old)
     for option in options:
         if option not in entry.options:
             raise UnknownNameError(

@@ -18,7 +18,7 @@ from casadi_ik.collision.scene import Obstacle, Scene
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.solve.diagnosis import Freed, Relief, Remedies
+from casadi_ik.solve.diagnosis import ReleasedContact, Relief, Remedies
 from casadi_ik.solve.solution import BatchSolution, SuggestedFix
 from casadi_ik.solve.subproblems import (
     LocalRefinement,
@@ -171,7 +171,7 @@ class RemedyFinder:
         solved = [(relaxations[i], q) for i, q in solutions.items()]
         return relax_limits(self.subproblems, self.targets, self._limits, solved, self.q)
 
-    def _with_free_contacts(self) -> Iterator[Freed]:
+    def _with_free_contacts(self) -> Iterator[ReleasedContact]:
         freeings = self._relaxed_targets()
         if freeings:
             candidates = replace(
@@ -191,7 +191,7 @@ class RemedyFinder:
             )
             for i, q in self._solutions(candidates, self._limits.tiled(len(candidates))).items():
                 item, finger, _ = freeings[i]
-                yield Freed(item, finger, q)
+                yield ReleasedContact(item, finger, q)
 
     @property
     def _limits(self) -> MotorBounds:

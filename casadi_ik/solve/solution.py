@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.lazy_import import RecordReprMixin, ReprMixin, import_lazily
+from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.solve.diagnosis import Diagnosis
@@ -31,26 +32,44 @@ class SuggestedFix:
     """Changes of a target under which a grasp in collision becomes solvable, among those tried.
 
     Attributes:
-        moved: Shortest translation of the object and its contacts that gives a collision-free
+        translation: Shortest translation of the object and its contacts that gives a collision-free
             solution with the object itself free, base frame [m]; None: no translation does.
-        farthest: Longest translation that was tried [m].
-        fewer: Fingers whose contact can be dropped to obtain a collision-free solution.
+        max_translation: Longest translation that was tried [m].
+        dispensable: Fingers whose contact can be dropped to obtain a collision-free solution.
     """
 
-    moved: tuple[float, float, float] | None
-    farthest: float
-    fewer: tuple[str, ...]
+    translation: tuple[float, float, float] | None
+    max_translation: float
+    dispensable: tuple[str, ...]
 
     @property
     def lines(self) -> tuple[str, ...]:
         """Summary in short lines."""
-        lines = [f"solvable without the contact of {name}" for name in self.fewer]
-        if self.moved is None:
-            far = f"{1e3 * self.farthest:.0f} mm"
-            return (*lines, f"the object moved by up to {far} in 26 directions does not help")
-        vector = ", ".join(f"{1e3 * value + 0.0:.0f}" for value in self.moved)
-        length = 1e3 * math.hypot(*self.moved)
+        lines = [f"solvable without the contact of {name}" for name in self.dispensable]
+        if self.translation is None:
+            limit = f"{1e3 * self.max_translation:.0f} mm"
+            return (*lines, f"the object moved by up to {limit} in 26 directions does not help")
+        vector = ", ".join(f"{1e3 * value + 0.0:.0f}" for value in self.translation)
+        length = 1e3 * math.hypot(*self.translation)
         return (*lines, f"solvable with the object moved by {length:.0f} mm: ({vector}) mm")
+
+    @property
+    def moved(self) -> tuple[float, float, float] | None:
+        """Deprecated name of `translation`."""
+        warn_renamed("SuggestedFix.moved", "SuggestedFix.translation")
+        return self.translation
+
+    @property
+    def farthest(self) -> float:
+        """Deprecated name of `max_translation`."""
+        warn_renamed("SuggestedFix.farthest", "SuggestedFix.max_translation")
+        return self.max_translation
+
+    @property
+    def fewer(self) -> tuple[str, ...]:
+        """Deprecated name of `dispensable`."""
+        warn_renamed("SuggestedFix.fewer", "SuggestedFix.dispensable")
+        return self.dispensable
 
 
 @dataclass(frozen=True)
@@ -60,7 +79,7 @@ class CollisionReport:
     Attributes:
         pair: Pair in collision in the best solution: two links, or a link and a solid.
         short: Clearance that the pair lacks [m].
-        tried: Number of solutions (hands, arms, elbows) that were checked.
+        n_checked: Number of solutions (hands, arms, elbows) that were checked.
         without_scene: Whether a solution is free of self-collision, ignoring the scene; None
             without a diagnosis.
         without_self: Whether a solution is free of the scene, ignoring self-collision; None
@@ -76,7 +95,7 @@ class CollisionReport:
 
     pair: Pair
     short: float
-    tried: int
+    n_checked: int
     without_scene: bool | None
     without_self: bool | None
     way_out: SuggestedFix | None = None
@@ -84,7 +103,9 @@ class CollisionReport:
     @property
     def lines(self) -> tuple[str, ...]:
         """Summary in short lines."""
-        answers = "the answer touches" if self.tried == 1 else f"all {self.tried} answers touch"
+        answers = (
+            "the answer touches" if self.n_checked == 1 else f"all {self.n_checked} answers touch"
+        )
         lines = [
             f"contacts and limits are met, but {answers} something",
             f"best answer: {self.pair[0]} and {self.pair[1]}, {1e3 * self.short:.3g} mm too near",
@@ -94,6 +115,12 @@ class CollisionReport:
         if self.without_self:
             lines.append("solvable if the robot could pass through itself")
         return tuple(lines) if self.way_out is None else (*lines, *self.way_out.lines)
+
+    @property
+    def tried(self) -> int:
+        """Deprecated name of `n_checked`."""
+        warn_renamed("CollisionReport.tried", "CollisionReport.n_checked")
+        return self.n_checked
 
 
 @dataclass(slots=True, eq=False, repr=False)
@@ -194,8 +221,8 @@ class Solution(ReprMixin):
         """
         robot = self.arm_hand or load_robot(self.robot)
         if grasp is None:
-            reached = zip(robot.fingers, *robot.contacts(self.q), strict=True)
-            grasp = Grasp({name: Contact(point, normal) for name, point, normal in reached})
+            contacts = zip(robot.fingers, *robot.contacts(self.q), strict=True)
+            grasp = Grasp({name: Contact(point, normal) for name, point, normal in contacts})
         return import_lazily("casadi_ik.app.pictures").draw_solution(
             robot, self, grasp, path, **options
         )
@@ -400,7 +427,7 @@ class BatchSolution(ReprMixin):
         return PalmVerdict(float(position[row]), float(angle[row]), bool(ok[row]))
 
 
-class Chosen(Protocol):
+class SolvedGrasp(Protocol):
     """A configuration that solves a grasp."""
 
     @property

@@ -20,13 +20,13 @@ def test_suggested_remedies_work(robot) -> None:
     solution = solver.solve(cup)
     assert solution.status is ik.Status.COLLISION
     remedies = solution.collision.way_out
-    assert 0 < np.linalg.norm(remedies.moved) <= remedies.farthest
+    assert 0 < np.linalg.norm(remedies.translation) <= remedies.max_translation
     pose = cup.object_pose.copy()
-    pose[:3, 3] += remedies.moved
+    pose[:3, 3] += remedies.translation
     assert solver.solve(cup.in_object_frame().at(pose)).success
     lines = "\n".join(solution.collision.lines)
-    assert f"moved by {1e3 * np.linalg.norm(remedies.moved):.0f} mm" in lines
-    for name in remedies.fewer:
+    assert f"moved by {1e3 * np.linalg.norm(remedies.translation):.0f} mm" in lines
+    for name in remedies.dispensable:
         fewer = {key: c for key, c in cup.contacts.items() if key != name}
         assert solver.solve(dataclasses.replace(cup, contacts=fewer)).success
         assert name in lines

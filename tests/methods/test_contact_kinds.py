@@ -312,7 +312,7 @@ def test_unsolved_pose_is_explained(robot, oracle, solvers):
     assert solution.diagnosis is not None
     assert solution.diagnosis.nearest["finger_2"].angle_error > 0.1
     assert ("normal", "finger_2") in [
-        (freed.part, freed.finger) for freed in solution.diagnosis.freed
+        (item.part, item.finger) for item in solution.diagnosis.released
     ]
 
 

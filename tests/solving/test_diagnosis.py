@@ -78,7 +78,7 @@ def test_contacts_too_far_apart(solver: ik.Solver, cup: tuple[Array, Array]) -> 
     diagnosis = proved(solver, spread, normals)
     assert diagnosis.reason is ik.solve.Reason.HAND
     assert diagnosis.hand is not None
-    assert not diagnosis.hand.fits
+    assert not diagnosis.hand.ok
     assert max(c.position_error for c in diagnosis.hand.contacts.values()) > 0.05
     assert "mm" in diagnosis.lines[1]
 
@@ -92,7 +92,7 @@ def test_too_far(
     assert diagnosis.reach is not None
     assert diagnosis.reach.farthest == pytest.approx(0.79)
     assert diagnosis.reach.excess == pytest.approx(distance - 0.79, abs=0.8)
-    assert diagnosis.reliefs == diagnosis.freed == ()
+    assert diagnosis.reliefs == diagnosis.released == ()
     numbers = [float(word) for word in re.findall(r"\d+\.?\d*", diagnosis.lines[1])]
     excess = diagnosis.reach.excess
     assert any(n == pytest.approx(unit * excess, rel=0.01) for n in numbers for unit in (1, 1e3))
@@ -120,11 +120,11 @@ def test_normal_that_faces_away(
     normals = normals * np.array([[-1], [1], [1]])
     diagnosis = diagnosed(solver, points, normals)
     assert diagnosis.reason is ik.solve.Reason.HAND
-    assert {(item.part, item.finger) for item in diagnosis.freed} >= {
+    assert {(item.part, item.finger) for item in diagnosis.released} >= {
         ("normal", "thumb"),
         ("finger", "thumb"),
     }
-    for item in diagnosis.freed:
+    for item in diagnosis.released:
         p, n = robot.contacts(item.q)
         other_columns = [i for i, name in enumerate(robot.fingers) if name != item.finger]
         assert np.linalg.norm((p - points)[other_columns], axis=1).max() <= 5e-3 * (1 + 1e-9)
@@ -142,7 +142,7 @@ def test_diagnosis_uses_the_object_pose(solver: ik.Solver) -> None:
     assert grasp_with_object.object_pose is not None
     diagnosis = solver.solve(grasp_with_object).diagnosis
     assert diagnosis is not None
-    assert ("finger", "finger_2") in {(item.part, item.finger) for item in diagnosis.freed}
+    assert ("finger", "finger_2") in {(item.part, item.finger) for item in diagnosis.released}
     up[2, 3] = 0.02
     assert solver.track([grasp, grasp.at(up)], period=0.1).success.all()
 
@@ -171,8 +171,8 @@ def test_single_limit_is_named(solver: ik.Solver, robot: ik.ArmHand) -> None:
             assert np.linalg.norm(residual(best, robot, points, normals)) > 1e-2
             assert diagnosis.reason is not ik.solve.Reason.REACHABLE
             (relief,) = (item for item in diagnosis.reliefs if item.lifted == name)
-            assert list(relief.beyond) == [name]
-            assert 0 < abs(relief.beyond[name]) <= np.deg2rad(5.3)
+            assert list(relief.violations) == [name]
+            assert 0 < abs(relief.violations[name]) <= np.deg2rad(5.3)
             assert np.linalg.norm(robot.contacts(relief.q)[0] - points, axis=1).max() <= 5.01e-4
             assert f"{name} " in "\n".join(diagnosis.lines)
             blocked += 1
@@ -293,7 +293,7 @@ def test_remedies_survive_pickling(solver: ik.Solver, cup: tuple[Array, Array]) 
     diagnosis = diagnosed(solver, cup[0], normals)
     copy = pickle.loads(pickle.dumps(diagnosis))
     assert copy.freed
-    assert [item.finger for item in copy.freed] == [item.finger for item in diagnosis.freed]
+    assert [item.finger for item in copy.freed] == [item.finger for item in diagnosis.released]
     assert copy.lines == diagnosis.lines
     assert copy.nearest == diagnosis.nearest
 
@@ -362,7 +362,7 @@ def test_free_finger(robot: ik.ArmHand, cup: tuple[Array, Array], finger: int) -
     assert diagnosis is not None
     assert diagnosis.reason is ik.solve.Reason.REACH
     assert np.isnan(diagnosis.nearest[robot.fingers[finger]].position_error)
-    assert robot.fingers[finger] not in {item.finger for item in diagnosis.freed}
+    assert robot.fingers[finger] not in {item.finger for item in diagnosis.released}
 
 
 def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
@@ -383,7 +383,7 @@ def test_fixed_actuators(robot: ik.ArmHand, cup: tuple[Array, Array]) -> None:
     assert diagnosis.reason is ik.solve.Reason.HAND
     assert diagnosis.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)
     for relief in diagnosis.reliefs:
-        assert "bh_spread" not in relief.beyond
+        assert "bh_spread" not in relief.violations
         assert relief.q[robot.actuators.index("bh_spread")] == pytest.approx(2.5)
 
 

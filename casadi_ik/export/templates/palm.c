@@ -50,7 +50,7 @@ int @PREFIX@_begin_palm(@PREFIX@_solver *solver, const scalar *palm, const scala
   (void) @PREFIX@_begin(solver, points, normals, q0);
   for (i = 0; i < N_MOTORS; ++i) {
     if (!OF_HAND[i]) continue;
-    solver->terms[TERMS_LOWER + i] = solver->terms[TERMS_UPPER + i] =
+    solver->settings[SETTINGS_LOWER + i] = solver->settings[SETTINGS_UPPER + i] =
         clipped(posture[i], LOWER[i], UPPER[i]);
   }
   return (int) solver->status;

@@ -24,8 +24,8 @@ static void end_scene_search(@PREFIX@_solver *solver, int is_free) {
 @BODY{@
   scene->has_pair_list = 0;
 @}@
-  if (!is_free && solver->terms[TERMS_NEAREST] > 0 && !scene->preference_dropped) {
-    solver->terms[TERMS_NEAREST] = 0;
+  if (!is_free && solver->settings[SETTINGS_NEAREST] > 0 && !scene->preference_dropped) {
+    solver->settings[SETTINGS_NEAREST] = 0;
     memcpy(solver->q0, HOME, sizeof solver->q0);
     scene->preference_dropped = 1;
     solver->slot = -1;
@@ -46,8 +46,9 @@ static void end_scene_search(@PREFIX@_solver *solver, int is_free) {
 static int choose_free_arm(@PREFIX@_solver *solver, const scalar *q_hand) {
   scalar q[N_MOTORS];
   memcpy(q, q_hand, sizeof q);
-  return @PREFIX@_arm_is_free(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER,
-                              solver->terms[TERMS_NEAREST] > 0, q)
+  return @PREFIX@_arm_is_free(solver, solver->settings + SETTINGS_LOWER,
+                              solver->settings + SETTINGS_UPPER,
+                              solver->settings[SETTINGS_NEAREST] > 0, q)
       && set_answer(solver, q) && surplus_of(solver, q) >= -CLEARANCE_ROUNDING;
 }
 
@@ -86,7 +87,7 @@ static int add_if_new(search *job, const scalar *q, scalar *hand_poses, int64_t 
 /* Returns the preference score of a hand, higher is better. Without an arm in closed form the motors
  * of the arm count too. */
 static scalar hand_rating(const @PREFIX@_solver *solver, const scalar *q) {
-  const int prefer_q0 = solver->terms[TERMS_NEAREST] > 0;
+  const int prefer_q0 = solver->settings[SETTINGS_NEAREST] > 0;
   const int count = HAS_CLOSED_ARM ? N_HAND : N_MOTORS;
   scalar rating = prefer_q0 ? 0 : INFINITY;
   int k;
@@ -116,7 +117,8 @@ static void record_hand(@PREFIX@_solver *solver, scalar *q) {
     scene->best_surplus = surplus;
     memcpy(scene->best_q, q, sizeof scene->best_q);
   }
-  is_free = @PREFIX@_hand_is_free(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER, q);
+  is_free = @PREFIX@_hand_is_free(solver, solver->settings + SETTINGS_LOWER,
+                                  solver->settings + SETTINGS_UPPER, q);
   scene->has_new_hand |= add_if_new(solver, q, scene->recorded_hands, &scene->n_recorded_hands);
   if (!is_free || !add_if_new(solver, q, scene->free_hands, &scene->n_free_hands)) return;
   rating = hand_rating(solver, q);
@@ -164,7 +166,7 @@ static void begin_scene_search(@PREFIX@_solver *solver) {
 /* Starts the fit of the next hand of this restart. */
 static int begin_hand(search *job) {
   @PREFIX@_scene *scene = &job->scene;
-  const scalar *inputs[5], preference = job->terms[TERMS_NEAREST];
+  const scalar *inputs[5], preference = job->settings[SETTINGS_NEAREST];
   scalar *outputs[2], start[N_MOTORS];
   map_job map = mapping(1, inputs, ALONE, outputs, ALONE);
   int code = DONE, i;
@@ -172,9 +174,9 @@ static int begin_hand(search *job) {
     scene->has_new_hand = 0;
     /* All candidates are fitted, so that their order is irrelevant, and the search has started from
      * q0 before. */
-    job->terms[TERMS_NEAREST] = 0;
+    job->settings[SETTINGS_NEAREST] = 0;
     code = seed_from_tables(job, scene->restart);
-    job->terms[TERMS_NEAREST] = preference;
+    job->settings[SETTINGS_NEAREST] = preference;
   }
   if (code != DONE) return code;
   for (i = 0; i < N_CANDIDATES; ++i) {
@@ -182,13 +184,13 @@ static int begin_hand(search *job) {
            N_HAND * sizeof(scalar));
   }
   for (i = 0; i < N_MOTORS; ++i) {
-    start[i] = clipped(job->q0[i], job->terms[TERMS_LOWER + i],
-                      job->terms[TERMS_UPPER + i]);
+    start[i] = clipped(job->q0[i], job->settings[SETTINGS_LOWER + i],
+                      job->settings[SETTINGS_UPPER + i]);
   }
   inputs[0] = job->points;
   inputs[1] = job->normals;
   inputs[2] = start;
-  inputs[3] = job->terms;
+  inputs[3] = job->settings;
   inputs[4] = job->seed_pool;
   outputs[0] = job->state;
   outputs[1] = job->parameters;
@@ -282,7 +284,8 @@ static int record_hands(search *job, scalar *q) {
   @PREFIX@_scene *scene = &job->scene;
   scalar palms[12 * N_SIDES], trunk_palms[16 * N_SIDES], surplus;
   int side, first = 0;
-  (void) @PREFIX@_hand_is_free(job, job->terms + TERMS_LOWER, job->terms + TERMS_UPPER, q);
+  (void) @PREFIX@_hand_is_free(job, job->settings + SETTINGS_LOWER,
+                               job->settings + SETTINGS_UPPER, q);
   surplus = surplus_of(job, q);
   if (surplus > scene->best_surplus) {
     scene->best_surplus = surplus;
@@ -322,7 +325,7 @@ static void begin_scene_search(@PREFIX@_solver *solver) {
     end_scene_search(solver, 1);
     return;
   }
-  @PREFIX@_list_pairs(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER);
+  @PREFIX@_list_pairs(solver, solver->settings + SETTINGS_LOWER, solver->settings + SETTINGS_UPPER);
   scene->is_searching = 1;
   scene->restart = scene->trunk_stage = scene->trunk_trial = scene->task = 0;
   scene->candidate = N_CANDIDATES;
@@ -344,7 +347,7 @@ static int begin_carrying(search *job, const scalar *q, const scalar *palms, int
   inputs[0] = job->points;
   inputs[1] = job->normals;
   inputs[2] = q;
-  inputs[3] = job->terms;
+  inputs[3] = job->settings;
   inputs[4] = job->seed_pool;
   outputs[0] = job->state;
   outputs[1] = job->parameters;
@@ -353,7 +356,7 @@ static int begin_carrying(search *job, const scalar *q, const scalar *palms, int
   memcpy(job->state + STATE_BEST_Q, q, N_MOTORS * sizeof(scalar));
   memcpy(job->state + STATE_PALMS, palms, 12 * N_SIDES * sizeof(scalar));
   for (i = 0; i < N_SIDES; ++i) job->state[STATE_ARM_MARGIN + i] = NO_MARGIN;
-  job->state[STATE_HAND_FITS] = 1.0;
+  job->state[STATE_MEETS_CONTACTS] = 1.0;
   job->parameters[PARAMETERS_PALMS_ONLY] = 1.0;
   job->state[STATE_PHASE] = phase;
   job->slot = -1;
@@ -384,7 +387,8 @@ static int begin_trunk(search *job) {
   }
   for (i = 0; i < N_TRUNK_AND_ARMS; ++i) {
     const int column = TRUNK_AND_ARMS[i];
-    const scalar low = job->terms[TERMS_LOWER + column], high = job->terms[TERMS_UPPER + column];
+    const scalar low = job->settings[SETTINGS_LOWER + column];
+    const scalar high = job->settings[SETTINGS_UPPER + column];
     scalar fraction = even(number + 1, TRUNK_AND_ARM_STEPS[i]);
     if (number % 2) fraction = clipped((fraction - 0.5) * TRUNK_STRETCH + 0.5, 0.0, 1.0);
     q[column] = low + fraction * (high - low);
@@ -443,8 +447,9 @@ static int continue_scene_search(@PREFIX@_solver *solver, int64_t max_iterations
   } else if (task == TRUNK_TASK && is_answer) {
     code = compute_palms(solver, q, palms, trunk_palms);
     if (code == DONE
-        && @PREFIX@_arms_are_free(solver, solver->terms + TERMS_LOWER, solver->terms + TERMS_UPPER,
-                                  solver->terms[TERMS_NEAREST] > 0, trunk_palms, q)) {
+        && @PREFIX@_arms_are_free(solver, solver->settings + SETTINGS_LOWER,
+                                  solver->settings + SETTINGS_UPPER,
+                                  solver->settings[SETTINGS_NEAREST] > 0, trunk_palms, q)) {
       scene->task = ARMS_TASK;
       code = begin_carrying(solver, q, palms, TRUNK_STAGE);
     }

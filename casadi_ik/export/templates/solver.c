@@ -10,7 +10,7 @@ typedef @PREFIX@_solver search;
 @CONSTANTS@
 @SEEDS@
 @SEARCH@
-@TERMS@
+@SETTINGS@
 @LIMITS@
 const char *const @PREFIX@_finger_names[] = {@FINGER_NAMES@};
 const char *const @PREFIX@_motor_names[] = {@MOTOR_NAMES@};
@@ -18,8 +18,8 @@ const char *const @PREFIX@_motor_names[] = {@MOTOR_NAMES@};
 @SCENE_SEARCH@
 void @PREFIX@_init(@PREFIX@_solver *solver) {
   memset(solver, 0, sizeof *solver);
-  memcpy(solver->terms, TERMS, sizeof TERMS);
-  memcpy(solver->ranges, TERMS + TERMS_LOWER, sizeof solver->ranges);
+  memcpy(solver->settings, SETTINGS, sizeof SETTINGS);
+  memcpy(solver->ranges, SETTINGS + SETTINGS_LOWER, sizeof solver->ranges);
   solver->max_restarts = ALL_ROUNDS;
   solver->status = @GUARD@_BAD_INPUT;
 @SCENE_INIT?@}
@@ -28,8 +28,8 @@ void @PREFIX@_set_tolerance(@PREFIX@_solver *solver, int finger, scalar position
   int i;
   for (i = 0; i < N_FINGERS; ++i) {
     if (finger >= 0 && i != finger) continue;
-    solver->terms[i] = position@LESS_POSITION?@;
-    solver->terms[N_FINGERS + i] = angle@LESS_ANGLE?@;
+    solver->settings[i] = position@LESS_POSITION?@;
+    solver->settings[N_FINGERS + i] = angle@LESS_ANGLE?@;
   }
 }
 
@@ -43,8 +43,8 @@ int @PREFIX@_begin(@PREFIX@_solver *solver, const scalar *points, const scalar *
   memcpy(solver->points, points, sizeof solver->points);
   memcpy(solver->normals, normals, sizeof solver->normals);
   memcpy(solver->q0, q0 ? q0 : HOME, sizeof solver->q0);
-  memcpy(solver->terms + TERMS_LOWER, solver->ranges, sizeof solver->ranges);
-  solver->terms[TERMS_NEAREST] = q0 ? 1 : 0;
+  memcpy(solver->settings + SETTINGS_LOWER, solver->ranges, sizeof solver->ranges);
+  solver->settings[SETTINGS_NEAREST] = q0 ? 1 : 0;
 @SCENE_BEGIN?@  if (!search_begin(solver)) solver->status = @GUARD@_BAD_INPUT;
   return (int) solver->status;
 }

@@ -3,9 +3,9 @@
 /* k targets with contiguous rows. */
 typedef struct {
   search *searches;            /* one for each slot of the loop */
-  const double *points, *normals, *extra_vectors, *q0, *terms;
+  const double *points, *normals, *extra_vectors, *q0, *settings;
   const int64_t *max_restarts;
-  int64_t terms_step;          /* doubles from one target's terms to the next's, 0 = the same */
+  int64_t settings_step;       /* doubles from one target's settings to the next's, 0 = the same */
   double *q, *counts;
   int64_t *restarts;
 } batch;
@@ -32,7 +32,7 @@ EXPORT int casadi_ik_follow(void *method, int64_t slot, int64_t solve, int32_t *
       job->extra_vectors[i] = rows->extra_vectors[3 * N_FINGERS * N_EXTRA_VECTORS * solve + i];
     }
     memcpy(job->q0, rows->q0 + N_MOTORS * solve, sizeof job->q0);
-    memcpy(job->terms, rows->terms + rows->terms_step * solve, sizeof job->terms);
+    memcpy(job->settings, rows->settings + rows->settings_step * solve, sizeof job->settings);
     job->max_restarts = rows->max_restarts[solve];
     job->restart_quota = FOREVER;
     job->has_verdict = 0;

@@ -39,7 +39,7 @@ class Searches:
         normals: (f, 3) pad normals, NaN where free; an input.
         extra_vectors: Further vectors of the contacts, (f, 3) each; inputs.
         q0: (n,) start configuration [rad or m]; an input.
-        terms: Parameters that targets share, see `state.terms`; an input.
+        settings: Settings that targets share, see `settings_layout`; an input.
         q: (n,) result [rad or m]; a call overwrites it, and all attributes below.
         position_error: (f,) distances [m] of contacts with points and normals only.
         angle_error: (f,) angles [rad] of these contacts.
@@ -75,7 +75,7 @@ class Searches:
         first = searches[0]
         self.points, self.normals = first["points"].reshape(f, 3), first["normals"].reshape(f, 3)
         self.extra_vectors = list(first["extra_vectors"][:-1].reshape(-1, f, 3))
-        self.q0, self.terms, self.q = first["q0"], first["terms"], first["q"]
+        self.q0, self.settings, self.q = first["q0"], first["settings"], first["q"]
         self.position_error, self.angle_error = first["position_error"], first["angle_error"]
         self.state, self.parameters = first["state"], first["parameters"]
         shape = plan.options.candidates, plan.sizes["N_HAND"]
@@ -90,7 +90,9 @@ class Searches:
             ctypes.c_int64.from_address(self._base + offsets[name][1])
             for name in ("max_restarts", "iterations", "restarts", "status", "paused")
         )
-        self._limit_violation = ctypes.c_double.from_address(self._base + offsets["beyond"][1])
+        self._limit_violation = ctypes.c_double.from_address(
+            self._base + offsets["limit_violation"][1]
+        )
 
     def _allocate_side(self, plan: SearchPlan, side: int) -> tuple[Any, ...]:
         """Allocate the seed searches of a side, one for each search of the multi-arm robot."""
@@ -106,16 +108,16 @@ class Searches:
         self._memory["hands"][:, side] = ctypes.cast(function, ctypes.c_void_p).value
         return references
 
-    def set_target(self, targets: TargetBatch, row: int, terms: Array) -> None:
+    def set_target(self, targets: TargetBatch, row: int, settings: Array) -> None:
         """Write a target to the arrays.
 
         Args:
             targets: k targets.
             row: Index of the target.
-            terms: Terms of the target.
+            settings: Settings of the target.
         """
         self.points[...], self.normals[...] = targets.points[row], targets.normals[row]
-        self.q0[...], self.terms[...] = targets.starts(self.plan.layouts.robot)[row], terms
+        self.q0[...], self.settings[...] = targets.starts(self.plan.layouts.robot)[row], settings
         for vectors, name in zip(
             self.extra_vectors, self.plan.layouts.contacts.data[2:], strict=True
         ):
@@ -181,14 +183,14 @@ class Searches:
     def seeds(self, number: int) -> Array:
         """Return the seeds (candidates, hand) of a restart for the target in the arrays."""
         # Without a preference, the seeds are not sorted.
-        self._first["round"], self.terms[-1] = number, 0.0
+        self._first["round"], self.settings[-1] = number, 0.0
         check(self._name, self._find_postures(self._address))
         return self.postures.copy()
 
     def batch(
         self,
         targets: TargetBatch,
-        terms: Array,
+        settings: Array,
         rounds: NDArray[np.int64],
         trace: bool,
     ) -> Outcome:
@@ -196,7 +198,7 @@ class Searches:
 
         Args:
             targets: The targets.
-            terms: Terms of the targets, (t,) or (k, t).
+            settings: Settings of the targets, (t,) or (k, t).
             rounds: (k,) maximum numbers of restarts.
             trace: Whether to keep every iteration.
         """
@@ -207,7 +209,7 @@ class Searches:
         inputs = [
             *map(np.ascontiguousarray, (targets.points, targets.normals)),
             np.stack(extra_vectors, axis=1) if extra_vectors else np.zeros(1),
-            *map(np.ascontiguousarray, (q0, terms)),
+            *map(np.ascontiguousarray, (q0, settings)),
             rounds,
         ]
         outputs = [
@@ -215,7 +217,7 @@ class Searches:
             np.empty((count, len(plan.layouts.phases))),
             np.empty(count, dtype=np.int64),
         ]
-        step = 0 if terms.ndim == 1 else terms.shape[1]
+        step = 0 if settings.ndim == 1 else settings.shape[1]
         job = (ctypes.c_int64 * 11)(self._base, *map(memory, inputs), step, *map(memory, outputs))
         fields: Any = self._memory.dtype.fields
         result = plan.solve.run_from_slots(

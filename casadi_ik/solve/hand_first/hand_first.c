@@ -117,7 +117,7 @@ static int start_restart(search *job) {
   inputs[1] = job->normals;
   for (i = 0; i < N_EXTRA_VECTORS; ++i) inputs[2 + i] = job->extra_vectors + 3 * N_FINGERS * i;
   inputs[2 + N_EXTRA_VECTORS] = job->q0;
-  inputs[3 + N_EXTRA_VECTORS] = job->terms;
+  inputs[3 + N_EXTRA_VECTORS] = job->settings;
   inputs[4 + N_EXTRA_VECTORS] = job->postures;
   outputs[0] = job->state;
   outputs[1] = job->parameters;
@@ -152,15 +152,15 @@ static int judge(search *job) {
   inputs[2] = job->normals;
   outputs[0] = job->position_error;
   outputs[1] = job->angle_error;
-  outputs[2] = &job->beyond;
+  outputs[2] = &job->limit_violation;
   code = JUDGE(&map);
   if (code != DONE) return code;
   for (i = 0; i < N_FINGERS; ++i) {
-    is_met &= job->position_error[i] <= job->terms[i] * slack || !is_number(job->points[3 * i]);
-    is_met &= job->angle_error[i] <= job->terms[N_FINGERS + i] * slack
+    is_met &= job->position_error[i] <= job->settings[i] * slack || !is_number(job->points[3 * i]);
+    is_met &= job->angle_error[i] <= job->settings[N_FINGERS + i] * slack
         || !is_number(job->normals[3 * i]);
   }
-  if (ENFORCE_LIMITS) is_met &= job->beyond <= LIMIT_SLACK;
+  if (ENFORCE_LIMITS) is_met &= job->limit_violation <= LIMIT_SLACK;
   if (is_met) job->status = SOLVED_STATUS;
   else if (job->status == SOLVED_STATUS) job->status = STALLED_STATUS;
   return DONE;
@@ -183,11 +183,11 @@ static void move_to_nearest_turns(search *job) {
   int i;
   for (i = 0; i < N_TURNING; ++i) {
     const int k = TURNING[i];
-    const double low = job->terms[TERMS_LOWER + k], high = job->terms[TERMS_UPPER + k];
+    const double low = job->settings[SETTINGS_LOWER + k], high = job->settings[SETTINGS_UPPER + k];
     const double q = job->q[k], turns = floor((job->q0[k] - q) / TURN + 0.5);
     if (CONTINUOUS[i] && low < high) {
       job->q[k] = q + TURN * turns + job->turns[i];
-    } else if (job->terms[TERMS_NEAREST] > 0) {
+    } else if (job->settings[SETTINGS_NEAREST] > 0) {
       const double first = ceil((low - q) / TURN), last = floor((high - q) / TURN);
       job->q[k] = q + TURN * clipped(turns, first < 0 ? first : 0.0, last > 0 ? last : 0.0);
     }
@@ -208,7 +208,7 @@ static int finish_target(search *job, int32_t status) {
   job->status = status == RUNNING ? ITERATION_LIMIT_STATUS
               : status == REPEATED ? STALLED_STATUS
               : status < 0 ? INVALID_STATUS : status;
-  if (job->preference_dropped) job->terms[TERMS_NEAREST] = 1.0;
+  if (job->preference_dropped) job->settings[SETTINGS_NEAREST] = 1.0;
   memcpy(job->q, job->state + STATE_Q, sizeof job->q);
 #if N_TURNING
   move_to_nearest_turns(job);

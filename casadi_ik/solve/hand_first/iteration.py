@@ -315,7 +315,9 @@ class VirtualIteration:
                 if not is_allowed and y["stage_iterations"][()] < step.trials[is_later_restart]:
                     return goes_to(Stage.ARM_PLACEMENT)
                 assign(stage_iterations=0)
-                return with_arm(is_allowed and results["arm_is_exact"] > 0 and x["hand_fits"] > 0)
+                return with_arm(
+                    is_allowed and results["arm_is_exact"] > 0 and x["meets_contacts"] > 0
+                )
             case Stage.ARM_CHOICE:
                 is_allowed = results["arm_is_allowed"] > 0
                 if y["stage_iterations"][()] < step.trials[2 if is_allowed else 3]:
@@ -324,7 +326,9 @@ class VirtualIteration:
                 if not is_allowed:
                     assign(arm_margin=ARM_SEARCH.no_margin)
                     return goes_to(arm_stage())
-                return with_arm(step.arm is not None and step.arm.is_exact and x["hand_fits"] > 0)
+                return with_arm(
+                    step.arm is not None and step.arm.is_exact and x["meets_contacts"] > 0
+                )
             case Stage.ARM_STEPS:
                 is_exact = results["cost"] < FIT.exact * FIT.exact
                 flipped = int(results["joint_to_flip"]) if is_settled and is_later_restart else 0
@@ -340,7 +344,7 @@ class VirtualIteration:
                 if has_starts and not (is_exact or is_close):
                     return goes_to(Stage.ARM_STEPS)
                 assign(arm_flipped_joint=0)
-                return with_arm(is_exact and x["hand_fits"] > 0)
+                return with_arm(is_exact and x["meets_contacts"] > 0)
             case Stage.REFINEMENT:
                 if cost < x["best_cost"]:
                     assign(best_cost=cost)

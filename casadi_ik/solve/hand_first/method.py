@@ -34,7 +34,7 @@ from casadi_ik.solve.hand_first.robot_parts import (
 )
 from casadi_ik.solve.hand_first.search_code import SearchPlan, can_search
 from casadi_ik.solve.hand_first.seeds import Seeds
-from casadi_ik.solve.hand_first.state import KEPT_ACROSS_RESTARTS, beginning
+from casadi_ik.solve.hand_first.state import KEPT_ACROSS_RESTARTS, first_state_graph
 from casadi_ik.solve.hand_first.step import HandFirstStep
 from casadi_ik.solve.looped_method import LoopedMethod, Start, coupling_jacobian
 from casadi_ik.solve.method import HandSearch, Outcome, SingleOutcome
@@ -88,7 +88,7 @@ class HandFirstMethod(LoopedMethod):
             self.step = HandFirstStep(robot, arm_family(robot), options.candidates, self._kinds)
         self.seeds = Seeds(robot, options, compiled)
         self._searches = SearchPool(self.plan)
-        self._cached_terms: tuple[Any, Array] | None = None
+        self._cached_settings: tuple[Any, Array] | None = None
 
     def step_graph(self) -> StepGraph:
         """Return the graph of an iteration."""
@@ -215,7 +215,7 @@ class HandFirstMethod(LoopedMethod):
         if reachable is not None:
             max_restarts[~reachable] = 0  # the first restart alone ends near unreachable palms
         with self._searches.lent(targets.enforce_limits, len(targets)) as searches:
-            return searches.batch(targets, self.terms(targets), max_restarts, trace)
+            return searches.batch(targets, self.settings(targets), max_restarts, trace)
 
     def _run_palms(
         self, targets: TargetBatch, outcome: Outcome, trace: bool, rounds: int | None
@@ -292,7 +292,7 @@ class HandFirstMethod(LoopedMethod):
         if not self.is_compiled or self._has_independent_sides:
             return None
         with self._searches.lent(targets.enforce_limits) as search:
-            search.set_target(targets, 0, self.terms(targets))
+            search.set_target(targets, 0, self.settings(targets))
             status = search(self._max_restarts(targets))
             if status is None:
                 return None
@@ -323,7 +323,7 @@ class HandFirstMethod(LoopedMethod):
         search, max_restarts = self.new_search(targets.enforce_limits), self._max_restarts(targets)
         if search is None:
             return super().stepper(targets)
-        search.set_target(targets, 0, self.terms(targets).reshape(-1))
+        search.set_target(targets, 0, self.settings(targets).reshape(-1))
 
         def next_restart(status: int, state: Array) -> Start | None:
             search.state[...] = state
@@ -341,15 +341,15 @@ class HandFirstMethod(LoopedMethod):
             targets: k targets.
             number: Number of the restart, below `options.rounds`.
         """
-        count, terms = self.options.candidates, self.terms(targets)
+        count, settings = self.options.candidates, self.settings(targets)
         if not self.is_compiled or not (number or self.robot.sides):
             table, row_count = self.seeds.table, (number + 1) * count
             return table.nearest(targets.points, targets.normals, row_count)[:, -count:]
-        terms_by_row = np.broadcast_to(terms, (len(targets), terms.shape[-1]))
+        settings_by_row = np.broadcast_to(settings, (len(targets), settings.shape[-1]))
         with self._searches.lent(targets.enforce_limits) as search:
             seeds = np.empty((len(targets), *search.postures.shape))
             for row in range(len(targets)):
-                search.set_target(targets, row, terms_by_row[row])
+                search.set_target(targets, row, settings_by_row[row])
                 seeds[row] = search.seeds(number)
         return seeds
 
@@ -444,7 +444,7 @@ class HandFirstMethod(LoopedMethod):
         # Kernels take a column as a vector: the seeds of one motor have no second dimension.
         seeds = seeds.reshape(len(targets), *self.first.input_shapes[-1])
         starts = targets.starts(self.robot)
-        states, parameters = self.first(*vectors, starts, self.terms(targets), seeds)
+        states, parameters = self.first(*vectors, starts, self.settings(targets), seeds)
         if skip_q0:
             layout = self.step.layouts.state
             states[:, layout.slice("phase")] = float(Phase.CANDIDATE)
@@ -455,20 +455,20 @@ class HandFirstMethod(LoopedMethod):
         """Run the loop from states and parameters made by `rows`."""
         return self.kernel.run(states, parameters, self.max_iterations)
 
-    def terms(self, targets: TargetBatch) -> Array:
-        """Return the parameters that targets share, see `state.terms`.
+    def settings(self, targets: TargetBatch) -> Array:
+        """Return the settings that targets share, see `settings_layout`.
 
         They are cached, because their computation takes as long as a solve.
         """
         if targets.fixed is not None:
-            return self._compute_terms(targets)
+            return self._compute_settings(targets)
         key = targets.tolerances, targets.enforce_limits, targets.prefer
-        cached = self._cached_terms
+        cached = self._cached_settings
         if cached is None or cached[0] != key:
-            self._cached_terms = cached = key, self._compute_terms(targets)
+            self._cached_settings = cached = key, self._compute_settings(targets)
         return cached[1]
 
-    def _compute_terms(self, targets: TargetBatch) -> Array:
+    def _compute_settings(self, targets: TargetBatch) -> Array:
         bounds = targets.bounds(self.robot)
         nearest = np.array([float(targets.prefers_q0)])
         fields = targets.position_tolerance, targets.angle_tolerance, *bounds, nearest
@@ -481,4 +481,4 @@ class HandFirstMethod(LoopedMethod):
     @cached_property
     def first(self) -> FunctionKernel:
         """Kernel of the first state and the parameters of a restart."""
-        return FunctionKernel(beginning(self.step.layouts), self._compiled)
+        return FunctionKernel(first_state_graph(self.step.layouts), self._compiled)

@@ -46,12 +46,12 @@ static int after_side(solve s, int is_idle) {
   for (i = 0; i < 12; ++i) {
     ENTRY(Y(PALM_ROTATION_0), 12 * side + i) = ENTRY(Y(PALM_ROTATION), i);
   }
-  ENTRY(Y(SIDE_FITS), side) = Y(HAND_FITS);
+  ENTRY(Y(SIDE_FITS), side) = Y(MEETS_CONTACTS);
   if (!is_idle && is_beyond_reach(s, side)) return to_next_candidate(s);
   if (X(CANDIDATE) > X(LAST_CANDIDATE)) Y(LAST_CANDIDATE) = X(CANDIDATE);
   if (side + 1 < N_SIDES) return to_side(s, side + 1, X(FIRST_CANDIDATE));
   for (i = 0; i < N_SIDES; ++i) {
-    if (!(ENTRY(Y(SIDE_FITS), i) > 0)) Y(HAND_FITS) = 0;
+    if (!(ENTRY(Y(SIDE_FITS), i) > 0)) Y(MEETS_CONTACTS) = 0;
   }
   Y(SIDE) = N_SIDES;
   Y(TRUNK_TRIALS) = 0;
@@ -64,7 +64,7 @@ static int after_side(solve s, int is_idle) {
 static int after_candidate(solve s) {
   if (!(X(CANDIDATE) < N_CANDIDATES)) return end_with_incumbent(s);
   if (FLAG(IS_IDLE)) {
-    Y(HAND_FITS) = 1;
+    Y(MEETS_CONTACTS) = 1;
     return after_side(s, 1);
   }
   return goes_to(s, HAND_FIT_STAGE + SIDE_OFFSET * (int) X(SIDE));
@@ -87,7 +87,7 @@ static int after_placement(solve s) {
   begin_fit(s);
   if (!FLAG(ARM_IS_EXACT)) return goes_to(s, TRUNK_STAGE);
   goes_to(s, REFINEMENT_STAGE);
-  return X(HAND_FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+  return X(MEETS_CONTACTS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
 }
 
 /* Return 1 if the target counts as out of reach after this trial. The larger the smallest cost of
@@ -98,7 +98,7 @@ static int is_out_of_reach(solve s) {
   const double max_weighted = N_SIDES < 2 ? MAX_WEIGHTED_TRIALS_ONE_ARM
                             : P(PALMS_ARE_FREE) > 0 ? MAX_WEIGHTED_TRIALS_FREE_PALMS
                             : MAX_WEIGHTED_TRIALS;
-  if (!N_TRUNK || !(X(HAND_FITS) > 0)) return 0;
+  if (!N_TRUNK || !(X(MEETS_CONTACTS) > 0)) return 0;
   Y(TRUNK_FITTING_TRIALS) = X(TRUNK_FITTING_TRIALS) + 1;
   if (!(X(TRUNK_FITTING_TRIALS) > 0) || RESULT(COST) < X(TRUNK_FITTING_MIN_COST)) {
     Y(TRUNK_FITTING_MIN_COST) = RESULT(COST);
@@ -153,7 +153,7 @@ static int after_trunk(solve s) {
   if (RESULT(COST) < EXACT_COST) {
     begin_fit(s);
     goes_to(s, REFINEMENT_STAGE);
-    return X(HAND_FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+    return X(MEETS_CONTACTS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
   }
   if (!FLAG(IS_SETTLED)) return goes_to(s, TRUNK_STAGE);
   if (!(X(TRUNK_ARMS_PLACED_AGAIN) > 0) && !(P(PALMS_ONLY) > 0)

@@ -254,7 +254,7 @@ class MultiArmStep(HandFirstStep):
             "q": with_rows(s["q"], side.hand, ca.if_else(accepted, next_x.hand, x.hand)),
             "palm_rotation": ca.if_else(accepted, next_x.rotation, x.rotation),
             "palm_origin": ca.if_else(accepted, next_x.origin, x.origin),
-            "hand_fits": outcome.within,
+            "meets_contacts": outcome.within,
         } | outcome.lm_state
         is_of_side = ca.DM.zeros(len(self.robot.fingers), 2)
         is_of_side[side.fingers, :] = 1

@@ -47,7 +47,7 @@ static int after_placement(solve s) {
   set_arm(s);
   Y(STAGE_ITERATIONS) = 0;
   goes_to(s, REFINEMENT_STAGE);
-  return FLAG(ARM_IS_ALLOWED) && FLAG(ARM_IS_EXACT) && X(HAND_FITS) > 0 ? SOLVED_STATUS
+  return FLAG(ARM_IS_ALLOWED) && FLAG(ARM_IS_EXACT) && X(MEETS_CONTACTS) > 0 ? SOLVED_STATUS
                                                                        : RUNNING_STATUS;
 }
 
@@ -62,7 +62,7 @@ static int after_choice(solve s) {
   set_arm(s);
   Y(STAGE_ITERATIONS) = 0;
   goes_to(s, REFINEMENT_STAGE);
-  return IS_EXACT && X(HAND_FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+  return IS_EXACT && X(MEETS_CONTACTS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
 }
 
 #if N_STARTS
@@ -114,7 +114,7 @@ static int after_arm_steps(solve s) {
   set_arm(s);
   Y(ARM_FLIPPED_JOINT) = 0;
   goes_to(s, REFINEMENT_STAGE);
-  return is_exact && X(HAND_FITS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
+  return is_exact && X(MEETS_CONTACTS) > 0 ? SOLVED_STATUS : RUNNING_STATUS;
 }
 #endif
 

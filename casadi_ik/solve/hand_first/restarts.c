@@ -50,7 +50,7 @@ static inline int starts_at_incumbent(const search *job, int64_t number) {
 static inline int has_wide_tolerance(const search *job) {
   int i, is_wide = 0;
   for (i = 0; i < N_FINGERS; ++i) {
-    is_wide |= job->terms[N_FINGERS + i] > WIDE_ANGLE && is_number(job->normals[3 * i]);
+    is_wide |= job->settings[N_FINGERS + i] > WIDE_ANGLE && is_number(job->normals[3 * i]);
   }
   return is_wide;
 }
@@ -88,8 +88,8 @@ static inline int next_restart(search *job) {
   do ++job->round;
   while (job->round < job->max_restarts && !restart_is_worthwhile(job));
   if (job->round < job->max_restarts) return 1;
-  if (!job->max_restarts || !(job->terms[TERMS_NEAREST] > 0)) return 0;
-  job->terms[TERMS_NEAREST] = 0.0;
+  if (!job->max_restarts || !(job->settings[SETTINGS_NEAREST] > 0)) return 0;
+  job->settings[SETTINGS_NEAREST] = 0.0;
   job->preference_dropped = 1;
   job->round = 0;
   return 1;

@@ -88,7 +88,7 @@ def palm_rows(
         "q": q,
         "best_q": q,
         "phase": first_stages,
-        "hand_fits": 1.0,
+        "meets_contacts": 1.0,
         "arm_margin": ARM_SEARCH.no_margin,
     }
     for side in range(len(method.robot.sides)):

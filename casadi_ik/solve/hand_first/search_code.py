@@ -30,7 +30,7 @@ from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.grasp import MAX_PLAIN_LENGTH, MIN_PLAIN_LENGTH, UNIT_ROUNDING
 from casadi_ik.solve.hand_first.parameters import HandFirstParameters
 from casadi_ik.solve.hand_first.seeds import FEATURES, Seeds
-from casadi_ik.solve.hand_first.state import HandFirstLayouts, Stage, terms
+from casadi_ik.solve.hand_first.state import HandFirstLayouts, Stage, settings_layout
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.turns import TURN
 from casadi_ik.solve.verdict import LIMIT_SLACK, TOLERANCE_SLACK
@@ -169,7 +169,7 @@ class SearchPlan:
             "N_FINGERS": len(robot.fingers),
             "N_MOTORS": len(robot.actuators),
             "N_HAND": len(robot.hand_actuators),
-            "N_TERMS": terms(robot).size,
+            "N_SETTINGS": settings_layout(robot).size,
             "N_STATE": layouts.state.size,
             "N_PARAMETERS": layouts.parameters.size,
             "N_CANDIDATES": self.options.candidates,
@@ -192,12 +192,16 @@ class SearchPlan:
             "extra_vectors": (double, 3 * f * extra + 1, "target: further vectors of contacts"),
             "q0": (double, n, "start configuration"),
             "turns": (double, max(self.sizes["N_TURNING"], 1), "full turns subtracted from q0"),
-            "terms": (double, self.sizes["N_TERMS"], "tolerances, bounds, 1 = q0 is preferred"),
+            "settings": (
+                double,
+                self.sizes["N_SETTINGS"],
+                "tolerances, bounds, 1 = q0 is preferred",
+            ),
             "max_restarts": (integer, None, "0: the first restart only, without a search"),
             "q": (double, n, "result"),
             "position_error": (double, f, "of the result [m], by finger"),
             "angle_error": (double, f, "of the result [rad], by finger"),
-            "beyond": (double, None, "largest violation of a limit by the result"),
+            "limit_violation": (double, None, "largest violation of a limit by the result"),
             "iterations": (integer, None, "number of iterations of the search"),
             "restarts": (integer, None, "number of hand postures tried after the first"),
             "status": (integer, None, "of the search, RUNNING until it ends"),
@@ -253,7 +257,10 @@ class SearchPlan:
         layouts, robot = self.layouts, self.layouts.robot
         state, names = layouts.state, self._state_fields
         offsets = {f"STATE_{name.upper()}": state.slice(name).start for name in names}
-        for label, layout in (("PARAMETERS", layouts.parameters), ("TERMS", terms(robot))):
+        for label, layout in (
+            ("PARAMETERS", layouts.parameters),
+            ("SETTINGS", settings_layout(robot)),
+        ):
             for name in ("lower", "upper", "nearest"):
                 offsets[f"{label}_{name.upper()}"] = layout.slice(name).start
         return {

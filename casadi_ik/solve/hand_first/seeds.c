@@ -138,8 +138,8 @@ static void sort_by_distance_to_q0(search *job, int inserts_q0) {
   int i, j, k;
   for (k = 0; k < N_HAND; ++k) {
     const int column = HAND[k];
-    hand_of_q0[k] = clipped(job->q0[column], job->terms[TERMS_LOWER + column],
-                            job->terms[TERMS_UPPER + column]);
+    hand_of_q0[k] = clipped(job->q0[column], job->settings[SETTINGS_LOWER + column],
+                            job->settings[SETTINGS_UPPER + column]);
     scaled_q0[k] = hand_of_q0[k] / ORDER_RANGES[k];
   }
   for (i = 0; i < count; ++i) {
@@ -167,7 +167,7 @@ static int seed_from_tables(search *job, int64_t number) {
 #if REPAIRS
   if (number) {
     code = seed_repaired(job, number);
-    if (code == DONE && job->terms[TERMS_NEAREST] > 0) sort_by_distance_to_q0(job, 0);
+    if (code == DONE && job->settings[SETTINGS_NEAREST] > 0) sort_by_distance_to_q0(job, 0);
     return code;
   }
 #endif
@@ -178,6 +178,6 @@ static int seed_from_tables(search *job, int64_t number) {
       job->postures[i * N_HAND + k] = table_posture(table, job->seed_rows[first + i], k);
     }
   }
-  if (job->terms[TERMS_NEAREST] > 0) sort_by_distance_to_q0(job, !number);
+  if (job->settings[SETTINGS_NEAREST] > 0) sort_by_distance_to_q0(job, !number);
   return DONE;
 }

@@ -16,7 +16,7 @@ static int seed_from_tables(search *job, int64_t number) {
     for (i = 0; i < SIDE_MOTORS[side]; ++i) q0_of_side[i] = job->q0[SIDE_COLUMNS[side][i]];
     if (has_point) {
       code = HANDS(side, job->points + 3 * finger, job->normals + 3 * finger, q0_of_side,
-                   job->terms[TERMS_NEAREST] > 0, number, hands);
+                   job->settings[SETTINGS_NEAREST] > 0, number, hands);
       if (code != DONE) return code;
     }
     for (i = 0; i < N_CANDIDATES; ++i) {

@@ -234,7 +234,7 @@ class HandFirstLayouts:
             Field("candidate", doc="index of the hand posture; -1: the one of q0"),
             Field("candidates_before", doc="number of hand postures of earlier restarts"),
             Field("palm_number", doc="selects the first palm pose if contacts leave it free"),
-            Field("hand_fits", doc="1 if palm and hand meet the contacts"),
+            Field("meets_contacts", doc="1 if palm and hand meet the contacts"),
             Field("is_underactuated", doc="1 if hand or arm has too few free motors"),
             Field(
                 "repeated_minima", doc="number of fits and balances that end no lower than before"
@@ -418,8 +418,8 @@ def with_rows(q: Expr, rows: Sequence[int], values: Expr) -> Expr:
     return ca.vertcat(*(values[index[i]] if i in index else q[i] for i in range(q.numel())))
 
 
-def terms(robot: RobotDescription) -> Layout:
-    """Return the layout of the parameters that all targets of a batch share."""
+def settings_layout(robot: RobotDescription) -> Layout:
+    """Return the layout of the settings that targets share: tolerances, bounds and preference."""
     n, f = len(robot.actuators), len(robot.fingers)
     return Layout(
         (
@@ -432,25 +432,25 @@ def terms(robot: RobotDescription) -> Layout:
     )
 
 
-def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
+def first_state_graph(layouts: HandFirstLayouts) -> FunctionGraph:
     """Return the graph that computes the first state and the parameters of a restart.
 
     Hand motors that only move free fingers stay at q0; every start is clipped to the bounds.
 
     Returns:
         points (f, 3) [m], normals (f, 3) and the other vectors of the contacts, NaN where free;
-        q0 (n, 1), the `terms`, hand postures to try (candidates, hand) -> state, parameters.
+        q0 (n, 1), the `settings`, hand postures to try (candidates, hand) -> state, parameters.
     """
     robot = layouts.robot
     f, n = len(robot.fingers), len(robot.actuators)
-    name = ca.Function.fix_name(f"hand_first_beginning_{robot.name}{kinds_suffix(layouts.kinds)}")
+    name = ca.Function.fix_name(f"hand_first_start_{robot.name}{kinds_suffix(layouts.kinds)}")
     return FunctionGraph(
         name,
-        lambda: _build_beginning(name, layouts),
+        lambda: _build_first_state(name, layouts),
         {
             **{f"{vector}s": (f, 3) for vector in layouts.contacts.data},
-            "here": (n, 1),
-            "terms": (terms(robot).size, 1),
+            "q0": (n, 1),
+            "settings": (settings_layout(robot).size, 1),
             "postures": (layouts.candidates, len(layouts.robot.hand_actuators)),
         },
         ((layouts.state.size, 1), (layouts.parameters.size, 1)),
@@ -458,13 +458,13 @@ def beginning(layouts: HandFirstLayouts) -> FunctionGraph:
     )
 
 
-def _build_beginning(name: str, layouts: HandFirstLayouts) -> ca.Function:
+def _build_first_state(name: str, layouts: HandFirstLayouts) -> ca.Function:
     robot, hand = layouts.robot, list(layouts.robot.hand_actuators)
     f, n = len(robot.fingers), len(robot.actuators)
     vectors = {f"{vector}s": ca.SX.sym(f"{vector}s", f, 3) for vector in layouts.contacts.data}
     q0 = ca.SX.sym("q", n)
-    terms_vector = terms(robot).symbols("terms")
-    t = terms(robot).unpack(terms_vector)
+    settings_vector = settings_layout(robot).symbols("settings")
+    t = settings_layout(robot).unpack(settings_vector)
     postures = ca.SX.sym("postures", layouts.candidates, len(hand))
 
     is_set = {key: _is_number(array[:, 0]) for key, array in vectors.items()}
@@ -504,7 +504,7 @@ def _build_beginning(name: str, layouts: HandFirstLayouts) -> ca.Function:
         }
         | initial_lm_state()
     )
-    inputs = [*vectors.values(), q0, terms_vector, postures]
+    inputs = [*vectors.values(), q0, settings_vector, postures]
     return ca.Function(name, inputs, with_cse(state, parameters))
 
 

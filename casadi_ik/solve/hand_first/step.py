@@ -389,7 +389,7 @@ class HandFirstStep:
             "q": self._with_hand(s["q"], ca.if_else(accepted, next_x.hand, x.hand)),
             "palm_rotation": ca.if_else(accepted, next_x.rotation, x.rotation),
             "palm_origin": ca.if_else(accepted, next_x.origin, x.origin),
-            "hand_fits": outcome.within,
+            "meets_contacts": outcome.within,
         } | outcome.lm_state
         record = self.layouts.row(s, p, s["q"], Phase.HAND_FIT, trial, accepted)
         stage = Stage.TOLERANT_HAND_FIT if tolerant else Stage.HAND_FIT

@@ -49,14 +49,14 @@ class ThumbFirstParameters:
         damping: Damping of the first step of a start [-]; residuals are in 0.1 m and rad.
         step_cap: Largest change of a motor per iteration [rad, or fraction of the range of a
             slider].
-        eased: Factor of the damping after an accepted step, < 1.
-        tightened: Factor of the damping after a rejected step, > 1.
+        damping_decrease: Factor of the damping after an accepted step, < 1.
+        damping_increase: Factor of the damping after a rejected step, > 1.
         damping_floor: Smallest damping.
         damping_ceiling: Damping at which a rejected step ends a start.
         gain: Ratio of costs after and before a step above which progress is slow.
         patience: Number of consecutive iterations with slow progress that ends a start.
         budget: Maximum number of iterations per start.
-        as_it_is: Largest cost at q0 for which q0 and its hand posture are used as starts.
+        max_cost_of_q0: Largest cost at q0 for which q0 and its hand posture are used as starts.
     """
 
     starts: int = 32
@@ -65,14 +65,14 @@ class ThumbFirstParameters:
     step: str = "freeze"
     damping: float = 0.03
     step_cap: float = 0.3
-    eased: float = 1 / 3
-    tightened: float = 4.0
+    damping_decrease: float = 1 / 3
+    damping_increase: float = 4.0
     damping_floor: float = 1e-6
     damping_ceiling: float = 100.0
     gain: float = 0.9
     patience: int = 12
     budget: int = 100
-    as_it_is: float = 0.5
+    max_cost_of_q0: float = 0.5
 
     def __post_init__(self) -> None:
         if self.step not in STEP_METHODS:

@@ -312,7 +312,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
         )
         has_failed = ca.logic_and(is_finished, ca.logic_not(ca.logic_or(solved, starts_minimax)))
         next_phase = ca.if_else(is_finished, float(Phase.CANDIDATE), float(Phase.HAND_ALIGNMENT))
-        factor = ca.if_else(accepted, self.options.eased, self.options.tightened)
+        factor = ca.if_else(accepted, self.options.damping_decrease, self.options.damping_increase)
         damping = ca.fmax(s["damping"] * factor, self.options.damping_floor)
         is_best = cost < s["best_cost"]
         next_state = self.next_state(
@@ -357,7 +357,7 @@ class ThumbFirstStep(ThumbFirstLayouts):
             return ca.SX(0)
         is_first = ca.logic_and(s["stage_iterations"] < 1, s["start"] <= 0)
         return ca.logic_and(
-            ca.logic_and(p["prefers_q0"], is_first), errors.cost > self.options.as_it_is
+            ca.logic_and(p["prefers_q0"], is_first), errors.cost > self.options.max_cost_of_q0
         )
 
 
