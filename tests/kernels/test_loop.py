@@ -469,8 +469,8 @@ def test_small_batches_do_not_wait_for_a_compiler(monkeypatch, tmp_path, lanes):
     assert run(early, MIN_BATCH_FOR_LANES)[: len(few)] == few
     assert compiled() == 1
     later = LoopKernel(step)
-    assert later._loop_for(MIN_SOLVES_IN_LANES - 1) is None
-    assert later._loop_for(MIN_SOLVES_IN_LANES) is not None
+    assert later.loop_for(MIN_SOLVES_IN_LANES - 1) is None
+    assert later.loop_for(MIN_SOLVES_IN_LANES) is not None
     assert run(later, MIN_BATCH_FOR_LANES - 1) == few
 
 
