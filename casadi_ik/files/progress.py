@@ -18,7 +18,7 @@ LINE_INTERVAL = 10.0
 @contextmanager
 def progress(
     count: int,
-    shown: bool = True,
+    visible: bool = True,
     done: int = 0,
     say: Callable[[str], object] | None = None,
 ) -> Iterator[Callable[[int], None]]:
@@ -26,7 +26,7 @@ def progress(
 
     Args:
         count: Total number of targets.
-        shown: False to draw no bar.
+        visible: False to draw no bar.
         done: Number of targets that are done already.
         say: Function that is called with a progress line every ten seconds where there is neither a
             terminal nor a notebook; None for no lines.
@@ -36,7 +36,7 @@ def progress(
     """
     began = last_line = time.monotonic()
     total, visible_bar = done, None
-    draw = _bar(count) if shown else None
+    draw = _bar(count) if visible else None
 
     def advance(targets: int) -> None:
         nonlocal total, last_line, visible_bar

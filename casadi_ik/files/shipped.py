@@ -80,7 +80,7 @@ def resolve_description(
 def resolve_robot(
     name_or_path: str | Path, relative_to: Path | None = None
 ) -> Path | tuple[Path | None, Path | None]:
-    """Return the file of a robot, or the files of an arm and a hand, one of which may be None.
+    """Return the file of a robot, or the files of an arm (or None) and a hand (or None).
 
     Args:
         name_or_path: Shipped arm-hand, multi-arm robot, arm or hand, "ARM+HAND" or "BODY+HAND" of

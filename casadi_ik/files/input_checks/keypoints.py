@@ -44,53 +44,54 @@ class FrameLimits:
     """Largest differences between a frame of a hand and other frames of the same person.
 
     Attributes:
-        speed: Largest speed of a keypoint [m/s]; hands of people are slower than 10 m/s.
-        slack: Distance that a keypoint may jump at any speed [m]: noise of fast trackers.
-        stretch: Largest length of a bone over its median length in previous frames [-].
-        palm_lengths: Additional length of a bone, in lengths of the palm [-].
-        spread: Largest distance of a wrist at exactly zero from the middle of the hand, over the
-            median distance of the keypoints from there [-].
+        max_speed: Largest speed of a keypoint [m/s]; hands of people are slower than 10 m/s.
+        max_jump: Distance that a keypoint may jump at any speed [m]: noise of fast trackers.
+        max_stretch: Largest length of a bone over its median length in previous frames [-].
+        max_extra_palm_lengths: Additional length of a bone, in lengths of the palm [-].
+        max_wrist_offset: Largest distance of a wrist at exactly zero from the middle of the hand,
+            over the median distance of the keypoints from there [-].
         memory: Number of frames in the median.
-        flatness: Smallest sine of the angle between the directions to the two knuckles [-].
+        min_flatness: Smallest sine of the angle between the directions to the two knuckles [-].
     """
 
-    speed: float = 10.0
-    slack: float = 0.05
-    stretch: float = 3.0
-    palm_lengths: float = 1.0
-    spread: float = 4.0
+    max_speed: float = 10.0
+    max_jump: float = 0.05
+    max_stretch: float = 3.0
+    max_extra_palm_lengths: float = 1.0
+    max_wrist_offset: float = 4.0
     memory: int = 31
-    flatness: float = 1e-4
+    min_flatness: float = 1e-4
 
 
 FRAME_LIMITS = FrameLimits()
 
 
-def lost_frame_reason(frame: Array, used: NDArray[np.intp], wrist: int = 0) -> str:
+def lost_frame_reason(frame: Array, checked_keys: NDArray[np.intp], wrist: int = 0) -> str:
     """Return why a single frame cannot be a hand; "" if it can.
 
     Args:
         frame: (21, 3) keypoints [m].
-        used: Keypoints that are checked, each once.
+        checked_keys: Keypoints that are checked, each once.
         wrist: Keypoint of the wrist.
     """
-    points = frame[used]
+    points = frame[checked_keys]
     if not np.isfinite(points).all():
         return "a keypoint is not finite"
     rows = points.tolist()
-    for key, (x, y, z) in zip(used.tolist(), rows, strict=True):
+    for key, (x, y, z) in zip(checked_keys.tolist(), rows, strict=True):
         if not (x == y == z and x in SENTINELS):
             continue
         if key == wrist:  # the wrist may be the origin of the keypoints
             distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-            if distances[used == wrist][0] <= FRAME_LIMITS.spread * float(np.median(distances)):
+            max_offset = FRAME_LIMITS.max_wrist_offset * float(np.median(distances))
+            if distances[checked_keys == wrist][0] <= max_offset:
                 continue
         return f"keypoint {key} is exactly {x:g} {y:g} {z:g}"
     if len(set(map(tuple, rows))) < len(rows):
         return "two keypoints coincide"
     index, little = frame[KNUCKLES[0]] - frame[wrist], frame[KNUCKLES[1]] - frame[wrist]
     squares, product = float(index @ index) * float(little @ little), float(index @ little)
-    if not squares - product**2 > FRAME_LIMITS.flatness**2 * squares:
+    if not squares - product**2 > FRAME_LIMITS.min_flatness**2 * squares:
         return "wrist and knuckles are on a line"
     return ""
 
@@ -109,14 +110,17 @@ class FrameFilter:
         reason: Why the last frame was rejected, "" if it was accepted.
     """
 
-    def __init__(self, used: Sequence[int], wrist: int = 0) -> None:
+    def __init__(self, checked_keys: Sequence[int], wrist: int = 0) -> None:
         """Create a filter.
 
         Args:
-            used: Keypoints that are checked.
+            checked_keys: Keypoints that are checked.
             wrist: Keypoint of the wrist.
         """
-        self._used, self._wrist = np.unique(np.array([*used, wrist, *KNUCKLES])), wrist
+        self._checked_keys, self._wrist = (
+            np.unique(np.array([*checked_keys, wrist, *KNUCKLES])),
+            wrist,
+        )
         self._bones: deque[Array] = deque(maxlen=FRAME_LIMITS.memory)
         self._reference: Array | None = None
         self._accepted: Array | None = None
@@ -134,9 +138,11 @@ class FrameFilter:
             frames: (k, 21, 3) keypoints [m].
             times: (k,) times [s].
         """
-        recording = FrameFilter(self._used.tolist(), self._wrist)
+        recording = FrameFilter(self._checked_keys.tolist(), self._wrist)
         usable = [
-            frame for frame in frames if not lost_frame_reason(frame, self._used, self._wrist)
+            frame
+            for frame in frames
+            if not lost_frame_reason(frame, self._checked_keys, self._wrist)
         ]
         for frame in usable[:: max(1, -(-len(usable) // FRAME_LIMITS.memory))]:
             recording._bones.append(bone_lengths(frame))
@@ -172,13 +178,16 @@ class FrameFilter:
         return True
 
     def _problem(self, frame: Array) -> str:
-        reason = lost_frame_reason(frame, self._used, self._wrist)
+        reason = lost_frame_reason(frame, self._checked_keys, self._wrist)
         if reason:
             return reason
         self._lengths = lengths = bone_lengths(frame)
         if self._reference is not None:
             palm = max(self._reference[4], self._reference[16])
-            max_lengths = FRAME_LIMITS.stretch * self._reference + FRAME_LIMITS.palm_lengths * palm
+            max_lengths = (
+                FRAME_LIMITS.max_stretch * self._reference
+                + FRAME_LIMITS.max_extra_palm_lengths * palm
+            )
             is_too_long = lengths > max_lengths
             if is_too_long.any():
                 bone = int(np.argmax(is_too_long))
@@ -187,12 +196,12 @@ class FrameFilter:
                     f"{self._reference[bone]:.3g} m in other frames"
                 )
         if self._accepted is not None:
-            displacements = frame[self._used] - self._accepted[self._used]
-            max_distance = FRAME_LIMITS.speed * self._elapsed + FRAME_LIMITS.slack
+            displacements = frame[self._checked_keys] - self._accepted[self._checked_keys]
+            max_distance = FRAME_LIMITS.max_speed * self._elapsed + FRAME_LIMITS.max_jump
             squares = np.einsum("ij,ij->i", displacements, displacements)
             if squares.max() > max_distance**2:
                 distances = np.sqrt(squares)
-                key = self._used[int(np.argmax(distances))]
+                key = self._checked_keys[int(np.argmax(distances))]
                 return f"keypoint {key} jumps by {distances.max():.3g} m in {self._elapsed:.3g} s"
         return ""
 
@@ -286,19 +295,19 @@ class OrderLimits:
     """Thresholds of the recognition of keypoint orders.
 
     Attributes:
-        fits: Largest misfit of the right order: root mean square of the logarithms of ratios to
-            `LENGTHS` [-].
-        better: Difference by which another order must fit better than the standard one.
-        frames: Largest number of frames that are compared.
-        smallest: Largest distance of two keypoints of a small fist [m].
-        largest: Largest distance of two keypoints of a large open hand [m].
+        max_misfit: Largest misfit of the right order: root mean square of the logarithms of ratios
+            to `LENGTHS` [-].
+        min_advantage: Difference by which another order must fit better than the standard one.
+        max_frames: Largest number of frames that are compared.
+        min_size: Largest distance of two keypoints of a small fist [m].
+        max_size: Largest distance of two keypoints of a large open hand [m].
     """
 
-    fits: float = 0.35
-    better: float = 0.15
-    frames: int = 30
-    smallest: float = 0.08
-    largest: float = 0.3
+    max_misfit: float = 0.35
+    min_advantage: float = 0.15
+    max_frames: int = 30
+    min_size: float = 0.08
+    max_size: float = 0.3
 
 
 ORDER_LIMITS = OrderLimits()
@@ -351,16 +360,16 @@ class OrderConverter:
         if self.is_decided:
             return frames if self.name == STANDARD_ORDER else frames[:, KEYPOINT_ORDERS[self.name]]
         complete = frames[np.isfinite(frames).all(axis=(1, 2))]
-        if not len(complete) or self._tries >= ORDER_LIMITS.frames:
+        if not len(complete) or self._tries >= ORDER_LIMITS.max_frames:
             return frames
         if self._newest is not None and np.array_equal(frames, self._newest):
             return frames
         self._newest, self._tries = frames.copy(), self._tries + 1
-        complete = complete[:: max(1, len(complete) // ORDER_LIMITS.frames)]
+        complete = complete[:: max(1, len(complete) // ORDER_LIMITS.max_frames)]
         self.name = recognise_order(complete)
         if not self.name:
             size = float(distances_between(complete).max())
-            if self._tries == 1 and ORDER_LIMITS.smallest < size < ORDER_LIMITS.largest:
+            if self._tries == 1 and ORDER_LIMITS.min_size < size < ORDER_LIMITS.max_size:
                 self._warn("are in none of the known orders")
             return frames
         self.is_decided = True
@@ -386,8 +395,11 @@ def recognise_order(frames: Array) -> str:
     distances = distances_between(frames)
     misfits = {name: misfit(distances, order) for name, order in KEYPOINT_ORDERS.items()}
     best = min(misfits, key=lambda name: misfits[name])
-    if misfits[best] > ORDER_LIMITS.fits:
+    if misfits[best] > ORDER_LIMITS.max_misfit:
         return ""
-    if best != STANDARD_ORDER and misfits[best] > misfits[STANDARD_ORDER] - ORDER_LIMITS.better:
+    if (
+        best != STANDARD_ORDER
+        and misfits[best] > misfits[STANDARD_ORDER] - ORDER_LIMITS.min_advantage
+    ):
         return ""
     return best

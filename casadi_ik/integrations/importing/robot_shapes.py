@@ -174,17 +174,17 @@ def _clearances(first: PosedCapsules, second: PosedCapsules) -> Array:
     Configurations in which the bounding spheres of all capsules are separate get infinity.
     """
     clearance = np.full(OVERLAP_SAMPLING.samples, np.inf)
-    near = _near_rows(first.center, second.center, first.radius + second.radius)
-    if not len(near):
+    near_rows = _near_rows(first.center, second.center, first.radius + second.radius)
+    if not len(near_rows):
         return clearance
     for i, radius in enumerate(first.radii):
         for j, other_radius in enumerate(second.radii):
-            segments, other_segments = first.segments[near, i], second.segments[near, j]
+            segments, other_segments = first.segments[near_rows, i], second.segments[near_rows, j]
             radii = radius + other_radius
             half_lengths = np.linalg.norm(segments[0, 3:]) + np.linalg.norm(other_segments[0, 3:])
             rows = _near_rows(segments[:, :3], other_segments[:, :3], half_lengths + radii)
             distance, _ = between_segments(segments[rows], other_segments[rows])
-            clearance[near[rows]] = np.minimum(clearance[near[rows]], distance - radii)
+            clearance[near_rows[rows]] = np.minimum(clearance[near_rows[rows]], distance - radii)
     return clearance
 
 
