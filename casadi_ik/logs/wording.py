@@ -28,10 +28,14 @@ def counted_noun(count: int, noun: str) -> str:
     return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
-def joined_names(names: Sequence[str], max_names: int = 4) -> str:
+MAX_NAMES = 4
+"""Maximum number of names in a sentence."""
+
+
+def joined_names(names: Sequence[str]) -> str:
     """Join the first names with commas and count the remaining ones."""
-    text = ", ".join(names[:max_names])
-    return text if len(names) <= max_names else f"{text} and {len(names) - max_names} more"
+    text = ", ".join(names[:MAX_NAMES])
+    return text if len(names) <= MAX_NAMES else f"{text} and {len(names) - MAX_NAMES} more"
 
 
 def errors_text(position: float, angle: float) -> str:

@@ -36,6 +36,13 @@ MIN_CLOSURE_LOAD = 1e-4
 MAX_LP_ITERATIONS, LP_GAP = 50, 1e-9
 """Maximum iterations of a linear program, and the mean complementarity x z at which it ends."""
 
+PATCH_RADIUS = 0.005
+"""Radius of a pad's contact patch [m].
+
+The patch resists a torque of 2/3 mu `PATCH_RADIUS` per unit normal force about its normal (Coulomb
+friction under uniform pressure).
+"""
+
 
 def friction_wrenches(
     points: Array,
@@ -43,7 +50,6 @@ def friction_wrenches(
     mu: float | Array,
     center: Array,
     length: float,
-    patch: float = 0.005,
 ) -> Array:
     """Return the edges of the friction cones of soft fingers, as wrenches per unit normal force.
 
@@ -53,8 +59,6 @@ def friction_wrenches(
         mu: Friction coefficient, or (k, c) coefficients by contact.
         center: (3,) reference point of torques [m].
         length: Length by which torques are divided [m].
-        patch: Radius of a pad's contact patch [m]. The patch resists a torque of 2/3 mu patch
-            about its normal (Coulomb friction under uniform pressure).
 
     Returns:
         (k, 6, c * (EDGES + 2)) force and torque / length of each edge.
@@ -70,7 +74,7 @@ def friction_wrenches(
     friction = np.broadcast_to(mu, (k, c))[..., None, None]
     force = np.concatenate([normal + friction * tangents, normal, normal], axis=-2)
     torque = np.cross((points - center)[..., None, :], force) / length
-    spin = 2 / 3 * friction[..., 0] * patch / length * normals
+    spin = 2 / 3 * friction[..., 0] * PATCH_RADIUS / length * normals
     torque[..., -2, :] += spin
     torque[..., -1, :] -= spin
     return np.concatenate([force, torque], axis=-1).reshape(k, c * (EDGES + 2), 6).swapaxes(1, 2)
@@ -228,8 +232,6 @@ def stiffnesses(
     jacobians: Array,
     springs: Array,
     mu: float,
-    patch: float = 0.005,
-    compliance: ComplianceParameters = COMPLIANCE,
 ) -> Array:
     """Return (k,) minimum stiffness of grasps to displacement and rotation of the object [N/m].
 
@@ -246,24 +248,22 @@ def stiffnesses(
         jacobians: (k, c, 3, m) derivatives of the contacts with respect to the motors.
         springs: (m,) stiffness of motors [N m/rad or N/m].
         mu: Friction coefficient.
-        patch: Radius of a contact patch [m].
-        compliance: Compliance of pads and contacts.
     """
     k, c, _, m = jacobians.shape
     # Rotations are scaled by this length, so that all entries of a stiffness are in N/m.
-    length = compliance.halving_displacement / compliance.halving_rotation
+    length = COMPLIANCE.halving_displacement / COMPLIANCE.halving_rotation
     flexibility = (jacobians / springs).reshape(k, 3 * c, m)
     flexibility = flexibility @ jacobians.reshape(k, 3 * c, m).swapaxes(1, 2)
-    flexibility += compliance.contact_compliance * np.eye(3 * c)
+    flexibility += COMPLIANCE.contact_compliance * np.eye(3 * c)
     eye = np.broadcast_to(np.eye(3), (k, c, 3, 3))
     contact_motion = np.concatenate([eye, -cross_matrices(arms) / length], axis=-1)
     contact_motion = contact_motion.reshape(k, 3 * c, 6)
     stiffness = contact_motion.swapaxes(1, 2) @ np.linalg.solve(flexibility, contact_motion)
     pressure = np.maximum((forces * normals).sum(axis=-1), 0.0)
-    torsion = 2 / 3 * mu * patch / compliance.slip_rotation * pressure
+    torsion = 2 / 3 * mu * PATCH_RADIUS / COMPLIANCE.slip_rotation * pressure
     rotational = np.einsum("kc,kci,kcj->kij", torsion, normals, normals)
     # The contact moves by rotation x (arm + radius normal), and the force with it.
-    centers = arms + np.where(radii > 0, radii, compliance.plane_radius)[..., None] * normals
+    centers = arms + np.where(radii > 0, radii, COMPLIANCE.plane_radius)[..., None] * normals
     rotational -= (cross_matrices(forces) @ cross_matrices(centers)).sum(axis=1)
     stiffness[:, 3:, 3:] += rotational / length**2
     symmetric = (stiffness + stiffness.swapaxes(1, 2)) / 2
