@@ -224,12 +224,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--against", type=Path, metavar="NPZ", help="compare with kept verdicts")
     parser.add_argument("--report", type=Path, default=Path("out/diagnosis"), help="folder")
     options = parser.parse_args(arguments)
-    robot, parts, called = ik.load_robot(options.robot), list[str](), ""
+    robot, parts, alarm_sentence = ik.load_robot(options.robot), list[str](), ""
     if options.count:
         heads = ["targets", "n", "solved", "solved by the diagnosis", "in doubt"]
         rows = false_alarms(robot, options.count, options.bad_starts, options.seed)
         alarms, count = (sum(int(row[i].replace(",", "")) for row in rows) for i in (-1, 1))
-        called = f"{alarms:,} of {count:,} reachable targets are called unreachable. "
+        alarm_sentence = f"{alarms:,} of {count:,} reachable targets are called unreachable. "
         parts += ["## False alarms", FALSE, markdown_table([*heads, "called unreachable"], rows)]
     rows, stored = verdicts(robot, options.impossible, options.seed)
     certain = min(float(row[4]) for row in rows)
@@ -245,7 +245,12 @@ def main(arguments: list[str] | None = None) -> None:
         np.savez(options.keep, allow_pickle=False, **stored)
     run_by, code = command(__file__, arguments), {"diagnosis": code_version()}
     publish(
-        "Diagnosis of unreachable targets", f"{called}{result}", parts, options.report, run_by, code
+        "Diagnosis of unreachable targets",
+        f"{alarm_sentence}{result}",
+        parts,
+        options.report,
+        run_by,
+        code,
     )
     print((options.report / "report.md").read_text(encoding="utf-8"))
 
