@@ -121,3 +121,15 @@ def test_palms_of_a_table(run: Command, tmp_path: Path) -> None:
     refused = run(*words)
     assert refused.exit == 2
     assert "grasps.csv: joint 'spread' is unknown" in refused.error.replace("\n", " ")
+
+
+def test_nearest_of_infeasible_candidates(run: Command, candidates: Path, tmp_path: Path) -> None:
+    out = tmp_path / "ranked.json"
+    far = ("--object-pose", "-3.0", "0.127", "0.41", "0", "0", "0.3")
+    done = run("choose", candidates, "--robot", ROBOT, *far, "--best-effort", "--out", out)
+    assert done.exit == 1
+    assert done.out.startswith("NEAREST")
+    report = json.loads(out.read_text())
+    assert report["answered"] == 0
+    assert len(report["ranked"]) == 4
+    assert all(item["score"] < -1 for item in report["ranked"])
