@@ -1,11 +1,11 @@
 """C code of SX Functions: one statement for each scalar operation.
 
 Numbers have the type `real`, results of comparisons the type `mask`. Operations that only one
-output behind the first needs are in a block that is skipped if the caller passes NULL for that
-output. Common subexpressions are written once. A Function that is never inlined
-(`kinematics.smooth.part`) is called, on arrays. The sine and the cosine of an angle are computed
-together, and one call computes up to `CodeOptions.width` sines or arcs that do not depend on each
-other.
+output after the first depends on are in a block that is skipped if the caller passes NULL for it.
+Common subexpressions are written once. A Function that is never inlined
+(`kinematics.smooth.call_function`) is called, on arrays. The sine and the cosine of an angle are
+computed together, and one call computes up to `CodeOptions.width` sines or arcs that do not depend
+on each other.
 """
 
 from __future__ import annotations

@@ -180,7 +180,7 @@ PERIOD = 0.004
 """Time between two frames [s]."""
 
 FOLLOW_STATUS = ("HOLDING", "FOLLOWING", "LATE", "MISSED")
-"""Names of the codes that `follow.h` defines, in their order."""
+"""Names of the codes that the exported header defines, in their order."""
 
 
 def frames_header(solver: Solver) -> str:

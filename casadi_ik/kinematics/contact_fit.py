@@ -1,4 +1,4 @@
-"""Least-squares and minimax fits of the contacts, and their convergence criteria.
+"""Least-squares fits of the contacts, and their convergence criteria.
 
 A trial step is evaluated by the change of the cost. The damping follows the ratio of the actual to
 the predicted decrease (Nielsen 1999: Damping parameter in Marquardt's method).
@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 
 from casadi_ik.compile.layout import Layout
-from casadi_ik.kinematics.box_qp import BoxBounds, clip, damped_step, normal_equations, solve_box_qp
+from casadi_ik.kinematics.box_qp import BoxBounds, clip, damped_step
 from casadi_ik.kinematics.contacts import (
     LENGTH,
     ContactRows,
@@ -24,10 +24,71 @@ from casadi_ik.kinematics.contacts import (
     tip_vectors,
     within_tolerance,
 )
-from casadi_ik.kinematics.fit_parameters import FIT, MINIMAX, TOLERANT_FIT
 from casadi_ik.kinematics.forward import actuated
 from casadi_ik.kinematics.smooth import Expr, call_function
 from casadi_ik.model.description import RobotDescription
+
+
+@dataclass(frozen=True)
+class FitParameters:
+    """Damping and convergence criteria of a fit.
+
+    Attributes:
+        damping: Initial damping of the normal matrix, whose rows are of order one per radian and
+            0.1 m.
+        damping_floor: Smallest damping.
+        damping_ceiling: Damping at which a rejected step ends the fit.
+        damping_down: Smallest factor of the damping after an accepted step.
+        growth: Factor of the damping after a rejected step; doubles with every further rejection.
+        slow: Ratio of costs after and before a step above which progress is slow.
+        quadratic: Ratio of costs below which convergence is fast, so that another step pays.
+        patience: Number of consecutive steps with slow progress that ends the fit.
+        budget: Maximum number of steps.
+        promising: Cost below which `patience` and `budget` are multiplied by `persistence`.
+        persistence: Factor of the effort for fits near a solution.
+        exact: Square root of the cost below which contacts are met exactly (0.1 nm per 100 mm, or
+            rad).
+        fine: Fraction of the tolerance below which errors count as exact.
+        passes: Number of corrections of the active set in a step.
+    """
+
+    damping: float = 1e-3
+    damping_floor: float = 1e-12
+    damping_ceiling: float = 1e4
+    damping_down: float = 1 / 8
+    growth: float = 4.0
+    slow: float = 0.9
+    quadratic: float = 0.1
+    patience: int = 3
+    budget: int = 15
+    promising: float = 1e-3
+    persistence: int = 10
+    exact: float = 1e-8
+    fine: float = 1e-3
+    passes: int = 2
+
+
+@dataclass(frozen=True)
+class TolerantFitParameters:
+    """Parameters of a fit of the errors beyond the tolerances.
+
+    Attributes:
+        free_fraction: Fraction of the tolerance within which an error costs nothing.
+        max_start_ratio: Largest `tolerance_ratio` at a minimum of the exact fit from which a
+            tolerant fit starts.
+        near_miss_ratio: Largest `tolerance_ratio` at which a minimum counts as a near miss.
+        patience: Number of consecutive steps with slow progress that ends the fit.
+        budget: Maximum number of steps.
+    """
+
+    free_fraction: float = 0.95
+    max_start_ratio: float = 1.0
+    near_miss_ratio: float = 2.0
+    patience: int = 4
+    budget: int = 40
+
+
+FIT, TOLERANT_FIT = FitParameters(), TolerantFitParameters()
 
 SMALLEST_NORM = 1e-100
 """Lower bound of norms and costs in divisors."""
@@ -152,7 +213,7 @@ def evaluate_excess_step(
         tolerance_fraction: Fraction of the tolerances at which the fit ends.
     """
     residual = ca.if_else(decreases_cost(trial), trial.residual, trial.residual_before)
-    max_excess = (tolerance_fraction - TOLERANT_FIT.free_fraction) * _tolerances(p)
+    max_excess = (tolerance_fraction - TOLERANT_FIT.free_fraction) * residual_tolerances(p)
     lengths = ca.vertcat(*(ca.norm_2(residual[rows_of_contact]) for rows_of_contact in rows.slices))
     within = ca.mmax(lengths - max_excess) <= 0
     return evaluate_step(s, trial, within, within, TOLERANT_FIT.patience, TOLERANT_FIT.budget)
@@ -248,7 +309,12 @@ def contact_jacobian(
 
 
 class ContactLeastSquares:
-    """Least-squares problem of the contacts in all motors q (n, 1)."""
+    """Least-squares problem of the contacts in all motors q (n, 1).
+
+    Attributes:
+        rows: Rows of the contacts.
+        layout: Layout of the parameters of a method.
+    """
 
     def __init__(self, robot: RobotDescription, rows: ContactRows, parameters: Layout) -> None:
         """Store the ingredients; the graph is built at the first use.
@@ -259,17 +325,17 @@ class ContactLeastSquares:
             parameters: Layout of the parameters of a method: fields of the rows, tolerances and
                 bounds.
         """
-        self._robot, self._rows, self._layout = robot, rows, parameters
+        self.rows, self.layout, self._robot = rows, parameters, robot
 
     @cached_property
     def linearised(self) -> ca.Function:
         """Graph ``(q, parameters) -> (residual, jacobian)`` with a sparse Jacobian."""
-        parameters = self._layout.symbols("parameters")
-        q, p = ca.SX.sym("q", len(self._robot.actuators)), self._layout.unpack(parameters)
-        residual = contact_residual(self._robot, self._rows, q, p)
+        parameters = self.layout.symbols("parameters")
+        q, p = ca.SX.sym("q", len(self._robot.actuators)), self.layout.unpack(parameters)
+        residual = contact_residual(self._robot, self.rows, q, p)
         # Rows of a contact have one pattern, so that least squares and minimax share functions.
-        slopes = contact_jacobian(self._robot, self._rows, q, p)
-        factors = (_in_columns(slopes[rows_of_contact, :]) for rows_of_contact in self._rows.slices)
+        slopes = contact_jacobian(self._robot, self.rows, q, p)
+        factors = (in_columns(slopes[rows_of_contact, :]) for rows_of_contact in self.rows.slices)
         jacobian = ca.vertcat(*(dense @ columns for dense, columns in factors))
         return call_function("whole_at", [q, parameters], [ca.densify(residual), jacobian])
 
@@ -281,7 +347,7 @@ class ContactLeastSquares:
             damping: Scalar.
             parameters: Parameters of the method.
         """
-        bounds = self._bounds(q, parameters)
+        bounds = self.bounds(q, parameters)
         return lm_step(
             lambda x: self.linearised(x, parameters),
             q,
@@ -298,61 +364,18 @@ class ContactLeastSquares:
             damping: Scalar.
             parameters: Parameters of the method.
         """
-        bounds, p = self._bounds(q, parameters), self._layout.unpack(parameters)
+        bounds, p = self.bounds(q, parameters), self.layout.unpack(parameters)
 
         def excess(x: Expr) -> tuple[Expr, Expr]:
             residual, jacobian = self.linearised(x, parameters)
-            return beyond_tolerance(residual, jacobian, self._rows, p)
+            return beyond_tolerance(residual, jacobian, self.rows, p)
 
         return lm_step(excess, q, damping, bounds, lambda step: clip(q + step, bounds))
 
-    def minimax_trial(
-        self, q: Expr, damping: Expr, powers_done: Expr, parameters: Expr
-    ) -> TrialStep:
-        """Return a step that reduces the p-norm of the error ratios, see `minimax_step`.
-
-        Args:
-            q: (n, 1) configuration before the step.
-            damping: Scalar, of the state.
-            powers_done: Number of completed powers of `MINIMAX.powers`.
-            parameters: Parameters of the method.
-        """
-        p, bounds = self._layout.unpack(parameters), self._bounds(q, parameters)
-        residual_before, jacobian = self.linearised(q, parameters)
-        right, slopes = reweighted(residual_before, jacobian, self._rows, powers_done, p)
-        normal, gradient = normal_equations(slopes, right)
-        low, high = bounds.lower - q, bounds.upper - q
-        step = solve_box_qp(normal, MINIMAX.damping * damping, gradient, low, high, FIT.passes)
-        x_after = clip(q + step, bounds)
-        max_change = ca.mmax(ca.fabs(x_after - q))
-        return TrialStep(
-            x_after, residual_before, self.linearised(x_after, parameters)[0], ca.SX(0), max_change
-        )
-
-    def _bounds(self, q: Expr, parameters: Expr) -> BoxBounds:
-        p = self._layout.unpack(parameters)
+    def bounds(self, q: Expr, parameters: Expr) -> BoxBounds:
+        """Return the bounds of a step from q within the limits of the motors."""
+        p = self.layout.unpack(parameters)
         return BoxBounds(q, p["lower"], p["upper"], first=0)
-
-
-@dataclass(frozen=True, eq=False)
-class MinimaxStep:
-    """Outcome of a trial step of the minimax stage.
-
-    Attributes:
-        q: (n, 1) configuration after the step, or before it if the step is rejected.
-        accepted: 1 if the step decreases the p-norm.
-        within: 1 if every contact is within tolerance at q.
-        is_finished: 1 if the stage has ended.
-        largest: Largest ratio of error to tolerance at q.
-        state: New values of the state fields of the stage.
-    """
-
-    q: Expr
-    accepted: Expr
-    within: Expr
-    is_finished: Expr
-    largest: Expr
-    state: dict[str, Expr]
 
 
 def tolerance_ratio(cost: Expr, p: dict[str, Expr]) -> Expr:
@@ -385,10 +408,10 @@ def beyond_tolerance(
         rows: Rows of the contacts.
         p: Parameters.
     """
-    free_lengths = TOLERANT_FIT.free_fraction * _tolerances(p)
+    free_lengths = TOLERANT_FIT.free_fraction * residual_tolerances(p)
     residuals, slopes = [], []
     for i, rows_of_contact in enumerate(rows.slices):
-        dense, columns = _in_columns(jacobian[rows_of_contact, :])
+        dense, columns = in_columns(jacobian[rows_of_contact, :])
         excess, slope = _shortened(*dense.shape)(residual[rows_of_contact], dense, free_lengths[i])
         residuals.append(excess)
         slopes.append(slope @ columns)
@@ -412,168 +435,13 @@ def _shortened(rows: int, columns: int) -> ca.Function:
     )
 
 
-def is_new_cost(cost: Expr, previous: Expr) -> Expr:
-    """Return whether the cost of a fit differs from that of the previous minimax start."""
-    return ca.fabs(cost - previous) > MINIMAX.same_cost_tolerance * previous
-
-
-@dataclass(frozen=True, eq=False)
-class _ContactWeights:
-    """Error ratios of the contacts and their weights in the p-norm.
-
-    Attributes:
-        scaled: Residual rows divided by the tolerances (size, 1).
-        ratios: Ratio of error to tolerance of each position and orientation (2 f, 1).
-        largest: Largest ratio.
-        power: Exponent p.
-        weights: Weights ``(ratio / largest)**(p - 2)``.
-    """
-
-    scaled: Expr
-    ratios: Expr
-    largest: Expr
-    power: Expr
-    weights: Expr
-
-
-def _contact_weights(
-    residual: Expr, contacts: ContactRows, powers_done: Expr, p: dict[str, Expr]
-) -> _ContactWeights:
-    """Return the error ratios of a residual and their weights for the current power."""
-    scaled = _relative_to_tolerances(residual, contacts, p)
-    ratios = _contact_norms(scaled, contacts)
-    largest = ca.fmax(ca.mmax(ratios), SMALLEST_NORM)
-    power = sum(
-        (ca.if_else(powers_done == i, value, 0.0) for i, value in enumerate(MINIMAX.powers)),
-        ca.SX(0),
-    )
-    return _ContactWeights(scaled, ratios, largest, power, (ratios / largest) ** (power - 2))
-
-
-def reweighted(
-    residual_before: Expr,
-    jacobian: Expr,
-    contacts: ContactRows,
-    powers_done: Expr,
-    p: dict[str, Expr],
-) -> tuple[Expr, Expr]:
-    """Return the reweighted least-squares problem of a Gauss-Newton step of the p-norm.
-
-    The rows of a contact are weighted by `_ContactWeights.weights`. Along its error the weight is
-    p - 1 times as large: the Jacobian is stretched along the error and the residual is shortened.
-
-    Args:
-        residual_before: Residual (size, 1) of the contacts.
-        jacobian: Jacobian (size, n) of the residual.
-        contacts: Rows of the contacts.
-        powers_done: Number of completed powers of `MINIMAX.powers`.
-        p: Parameters.
-
-    Returns:
-        Residual (size, 1) and Jacobian (size, n).
-    """
-    weights = _contact_weights(residual_before, contacts, powers_done, p)
-    tolerances = _tolerances(p)
-    residual, rows = [], []
-    for i, rows_of_contact in enumerate(contacts.slices):
-        dense, columns = _in_columns(jacobian[rows_of_contact, :])
-        scalars = (weights.ratios[i], weights.weights[i], weights.power, tolerances[i])
-        contact_residual, contact_slopes = _stretched(*dense.shape)(
-            residual_before[rows_of_contact], dense, *scalars
-        )
-        residual.append(contact_residual)
-        rows.append(contact_slopes @ columns)
-    return ca.vertcat(*residual), ca.vertcat(*rows)
-
-
-def _in_columns(rows: Expr) -> tuple[Expr, ca.DM]:
+def in_columns(rows: Expr) -> tuple[Expr, ca.DM]:
     """Return rows (m, n) as the product of a dense matrix and a selection of columns."""
     columns = sorted(set(rows.sparsity().get_col()))
     return ca.densify(rows[:, columns]), ca.DM.eye(rows.shape[1])[columns, :]
 
 
-@cache
-def _stretched(rows: int, columns: int) -> ca.Function:
-    """Return ``(residual, slopes, ratio, weight, power, tolerance) -> (residual, slopes)``."""
-    residual, slopes = ca.SX.sym("residual", rows), ca.SX.sym("slopes", rows, columns)
-    scalars = length, weight, power, tolerance = [
-        ca.SX.sym(name) for name in ("length", "weight", "power", "allowed")
-    ]
-    factor, size = ca.sqrt(power - 1), ca.sqrt(weight) / tolerance
-    direction = residual / (tolerance * ca.fmax(length, SMALLEST_NORM))
-    stretched_residual = size / factor * residual
-    stretched_slopes = size * (slopes + direction @ ((factor - 1) * (direction.T @ slopes)))
-    return call_function(
-        "stretched", [residual, slopes, *scalars], [stretched_residual, stretched_slopes]
-    )
-
-
-def minimax_step(
-    q: Expr, trial: TrialStep, contacts: ContactRows, s: dict[str, Expr], p: dict[str, Expr]
-) -> MinimaxStep:
-    """Evaluate a trial step of the minimax stage.
-
-    Args:
-        q: (n, 1) configuration before the step.
-        trial: Trial step with the residuals of the contacts.
-        contacts: Rows of the contacts.
-        s: State with damping, power (number of completed `MINIMAX.powers`) and spent.
-        p: Parameters.
-    """
-    initial = _contact_weights(trial.residual_before, contacts, s["power"], p)
-    weights, ratios_before, largest = initial.weights, initial.ratios, initial.largest
-    power = initial.power
-    ratios_after = _contact_norms(_relative_to_tolerances(trial.residual, contacts, p), contacts)
-    # Saturated because large ratios overflow at high powers.
-    growth = ca.fmin(ratios_after / largest, MINIMAX.max_growth)
-    sum_before, sum_after = (
-        ca.dot(weights, ratios_before**2),
-        ca.dot(growth ** (power - 2), ratios_after**2),
-    )
-    accepted = sum_after < sum_before
-    ratios = ca.if_else(accepted, ratios_after, ratios_before)
-    damping = MINIMAX.damping * s["damping"]
-    is_stalled = ca.if_else(
-        accepted, sum_after > MINIMAX.stall_ratio * sum_before, damping > MINIMAX.damping_ceiling
-    )
-    powers_done = s["power"] + is_stalled
-    steps = s["stage_iterations"] + 1
-    is_finished = ca.logic_or(powers_done >= len(MINIMAX.powers), steps >= MINIMAX.budget)
-    power_sum = ca.if_else(accepted, sum_after, sum_before) * largest ** (power - 2)
-    is_infeasible = power_sum > len(contacts.slices) * MINIMAX.infeasible_ratio**power
-    is_finished = ca.logic_or(is_finished, ca.logic_and(is_stalled, is_infeasible))
-    damping_factor = ca.if_else(accepted, MINIMAX.damping_decrease, MINIMAX.damping_increase)
-    state = {
-        "damping": ca.fmax(s["damping"] * damping_factor, MINIMAX.damping_floor),
-        "power": powers_done,
-        "stage_iterations": steps,
-    }
-    return MinimaxStep(
-        q=ca.if_else(accepted, trial.x, q),
-        accepted=accepted,
-        within=ca.mmax(ratios) <= 1,
-        is_finished=is_finished,
-        largest=ca.mmax(ratios),
-        state=state,
-    )
-
-
-def _relative_to_tolerances(values: Expr, contacts: ContactRows, p: dict[str, Expr]) -> Expr:
-    """Return rows (size, k) of the contacts divided by the tolerances."""
-    return values / _repeat_by_rows(_tolerances(p), contacts)
-
-
-def _tolerances(p: dict[str, Expr]) -> Expr:
+def residual_tolerances(p: dict[str, Expr]) -> Expr:
     """Return the tolerances (2 f, 1) in the units of the residual."""
     tolerances = ca.vertcat(p["position_tolerance"] / LENGTH, chord(p["angle_tolerance"]))
     return ca.fmax(tolerances, SMALLEST_NORM)
-
-
-def _repeat_by_rows(values: Expr, contacts: ContactRows) -> Expr:
-    """Repeat a value of each position and orientation (2 f, 1) for each of its rows (size, 1)."""
-    sizes = [rows.stop - rows.start for rows in contacts.slices]
-    return ca.vertcat(*(ca.repmat(values[i], size, 1) for i, size in enumerate(sizes)))
-
-
-def _contact_norms(scaled: Expr, contacts: ContactRows) -> Expr:
-    return ca.vertcat(*(ca.norm_2(scaled[rows]) for rows in contacts.slices))

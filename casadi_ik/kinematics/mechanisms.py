@@ -3,17 +3,17 @@
 *Lead screw*, eq. (8): a screw of length s between two arms b and c of a joint, s^2 = b^2 + c^2 -
 2 b c cos(theta). All lengths share one unit (m); theta in (0, pi) is the angle between the arms,
 from which a joint angle differs by an offset. Outside [|b - c|, b + c] there is no triangle;
-there theta stays within 1e-8 rad of 0 or pi, with derivative 0, so that nothing turns into NaN.
+there theta is within 1e-8 rad of 0 or pi and its derivative is 0, so that no result is NaN.
 
-*Four-bar*, eqs. (9) to (11), that bends a finger's last joint. Pivots O = (0, 0) and C = (g, 0)
-are fixed to the proximal phalanx. The crank OP of length p is the middle phalanx at the angle
-phi, the rod CQ of length q stands at psi, and PQ of length h is fixed to the distal phalanx at
-the angle phi + theta3. All angles are in rad, all lengths in one unit. The loop closes in two
-ways. `branch` = sigma = +-1 picks one and is the sign of sin(phi + theta3 - psi). The paper
-prints sigma = -1 only, and an `a` in eq. (11) that is the crank p (McCarthy's letter): with a = g
-the formula fails against finite differences. Both branches share one form of (11). Where the
-linkage cannot be assembled (`linkage_toggle` < 0) rod and coupler stay aligned: values and
-derivatives remain finite, and the measure tells.
+*Four-bar*, eqs. (9) to (11): it bends the last joint of a finger. Pivots O = (0, 0) and
+C = (g, 0) are fixed to the proximal phalanx. The crank OP of length p is the middle phalanx at the
+angle phi, the rod CQ of length q is at the angle psi, and PQ of length h is fixed to the distal
+phalanx at the angle phi + theta3. All angles are in rad, all lengths in one unit. The loop closes
+in two ways; `branch` = sigma = +-1 selects one and is the sign of sin(phi + theta3 - psi). The
+paper states sigma = -1 only. Its symbol `a` in eq. (11) is the crank p (McCarthy's notation): with
+a = g the formula disagrees with finite differences. Both branches share one form of (11). If the
+linkage cannot be assembled (`linkage_toggle` < 0), rod and coupler are aligned, and values and
+derivatives remain finite.
 """
 
 from __future__ import annotations

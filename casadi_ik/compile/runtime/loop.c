@@ -1,7 +1,7 @@
 /* The loop: runs a step until each solve of a batch ends.
  *
  * Compiled with LANES solves in vector lanes (lanes.c), or with one; the iterates of a solve are the
- * same bit for bit. When a solve ends, the method's callback `follow` (loop_job.c) may start it again
+ * same bit for bit. When a solve ends, the method's callback `follow` (jobs.c) may start it again
  * in the same slot.
  *
  * A step in lanes is cheapest if all lanes take the same branch. There are therefore more slots than

@@ -17,8 +17,9 @@ from casadi_ik.compile.function_kernel import BufferedFunction
 from casadi_ik.compile.graphs import StepGraph, recipe
 from casadi_ik.files.arrays import Array, spread_steps
 from casadi_ik.kinematics.arms.search import ARM_SEARCH
-from casadi_ik.kinematics.contact_fit import FIT, MINIMAX, TOLERANT_FIT, initial_lm_state
+from casadi_ik.kinematics.contact_fit import FIT, TOLERANT_FIT, initial_lm_state
 from casadi_ik.kinematics.contacts import LENGTH, kinds_suffix
+from casadi_ik.kinematics.minimax import MINIMAX
 from casadi_ik.kinematics.palm import NUMERIC_ARM_PARAMETERS, start_table
 from casadi_ik.model.description import RobotDescription, Side
 from casadi_ik.model.multi_arm import MAX_SIDES

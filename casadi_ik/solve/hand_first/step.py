@@ -39,7 +39,6 @@ from casadi_ik.kinematics.contact_fit import (
     evaluate_step,
     initial_lm_state,
     lm_step,
-    minimax_step,
     tolerance_ratio,
 )
 from casadi_ik.kinematics.contacts import (
@@ -51,6 +50,7 @@ from casadi_ik.kinematics.contacts import (
     within_tolerance,
 )
 from casadi_ik.kinematics.forward import Pose
+from casadi_ik.kinematics.minimax import minimax_step, minimax_trial
 from casadi_ik.kinematics.palm import (
     NUMERIC_ARM_PARAMETERS,
     POSE_DIMENSION,
@@ -517,7 +517,7 @@ class HandFirstStep:
     def _balance(self) -> ca.Function:
         """Build one minimax step of all motors."""
         inputs, s, p = self._vectors()
-        trial = self.layouts.all_motors.minimax_trial(s["q"], s["damping"], s["power"], inputs[1])
+        trial = minimax_trial(self.layouts.all_motors, s["q"], s["damping"], s["power"], inputs[1])
         outcome = minimax_step(s["q"], trial, self.layouts.contacts, s, p)
         results = {
             "is_settled": outcome.is_finished,

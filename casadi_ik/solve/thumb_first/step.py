@@ -27,15 +27,13 @@ from casadi_ik.kinematics.arms.family import ArmFamily
 from casadi_ik.kinematics.arms.search import ArmTrials, Farthest, Nearest
 from casadi_ik.kinematics.contact_fit import (
     FIT,
-    MINIMAX,
     ContactLeastSquares,
     evaluate_step,
     initial_lm_state,
-    is_new_cost,
-    minimax_step,
 )
 from casadi_ik.kinematics.contacts import kinds_suffix, within_tolerance
 from casadi_ik.kinematics.forward import Pose, motor_scales
+from casadi_ik.kinematics.minimax import MINIMAX, is_new_cost, minimax_step, minimax_trial
 from casadi_ik.kinematics.palm import (
     base_rotation,
     best_palm,
@@ -366,7 +364,7 @@ def minimax_stage(layouts: ThumbFirstLayouts) -> ca.Function:
     state, parameters = layouts.state.symbols("state"), layouts.parameters.symbols("parameters")
     s, p = layouts.state.unpack(state), layouts.parameters.unpack(parameters)
     problem = ContactLeastSquares(layouts.robot, layouts.contacts, layouts.parameters)
-    trial = problem.minimax_trial(s["q"], s["damping"], s["power"], parameters)
+    trial = minimax_trial(problem, s["q"], s["damping"], s["power"], parameters)
     outcome = minimax_step(s["q"], trial, layouts.contacts, s, p)
     has_failed = ca.logic_and(outcome.is_finished, ca.logic_not(outcome.within))
     next_state = layouts.next_state(
