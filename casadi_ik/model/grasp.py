@@ -291,10 +291,11 @@ class Contact:
 
     def at(self: Any, pose: ArrayLike | None = None) -> Contact:
         """Return `transformed(pose)`, or `from_pose(pose)` if called on the class; deprecated."""
-        is_instance = isinstance(self, Contact) and pose is not None
-        name = "transformed" if is_instance else "from_pose"
-        warn_renamed("Contact.at", f"Contact.{name}")
-        return self.transformed(pose) if is_instance else Contact.from_pose(self)
+        if pose is not None:
+            warn_renamed("Contact.at", "Contact.transformed")
+            return self.transformed(pose)
+        warn_renamed("Contact.at", "Contact.from_pose")
+        return Contact.from_pose(self)  # `self` is the pose in a call on the class
 
 
 @dataclass(frozen=True, eq=False)
