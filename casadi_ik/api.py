@@ -137,7 +137,7 @@ class Solver(MovingSolver):
 
     @cached_property
     def _single_restart_engine(self) -> Engine:
-        """Engine limited to one restart, for screening many targets of which one suffices."""
+        """Engine limited to one restart, for screening many targets until one is solved."""
         if self._engine.hand_search is None:
             return self._engine
         method, options = self.method, {**self.options, "max_rounds": 1}
@@ -153,7 +153,7 @@ class Solver(MovingSolver):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Everything except target, start and seed that determines a solve, as in the log.
+        """Method, tolerances, limits and options of every solve, as in the log.
 
         Example:
             >>> solver.parameters["method"], solver.parameters["limits"]

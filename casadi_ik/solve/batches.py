@@ -46,14 +46,14 @@ class SolvedPart:
         if self.outcome.rows is None:
             return
         batch = self.batch
-        before = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
+        elapsed = np.concatenate([[0.0], np.cumsum(batch.time)[:-1]])[: len(batch)]
         block = SolveBlock(
             format=trace_format,
             first=self.targets.first_row,
             targets=self.targets,
             batch=batch,
             rows=self.outcome.rows,
-            started=self.started + (before * 1e9).astype(np.int64),
+            started=self.started + (elapsed * 1e9).astype(np.int64),
             query=self.query,
         )
         recorder.record(block)
@@ -66,7 +66,7 @@ def judge_outcome(
     outcome: Outcome,
     query: CollisionQuery | None = None,
 ) -> BatchSolution:
-    """Check an outcome against its targets; the verdict decides what is solved.
+    """Check an outcome against its targets; the verdict decides on success.
 
     Args:
         robot: The robot.

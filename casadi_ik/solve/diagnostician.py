@@ -419,7 +419,7 @@ def _add_palm_errors(
     palms = judge_palms(robot, targets, np.stack([diagnosis.q for diagnosis in diagnoses]))
     if palms is None:
         return diagnoses
-    return [replace(diagnosis, palm=palms.of(row)) for row, diagnosis in enumerate(diagnoses)]
+    return [replace(diagnosis, palm=palms.row(row)) for row, diagnosis in enumerate(diagnoses)]
 
 
 def _with_free_fingers(targets: TargetBatch, fingers: list[int]) -> TargetBatch:

@@ -144,10 +144,10 @@ class Engine:
         Raises:
             InputError: The targets have several combinations of contact kinds.
         """
-        first, *others = (engine for engine, _, _ in self.group_by_contact_kind(targets))
-        if others:
+        engines = [engine for engine, _, _ in self.group_by_contact_kind(targets)]
+        if len(engines) > 1:
             raise InputError("grasps: found contacts of several kinds, expected the same in all")
-        return first
+        return engines[0]
 
     @property
     def hand_search(self) -> HandSearch | None:
@@ -269,8 +269,8 @@ class Engine:
         if (query := self.collision_query(targets)) is not None:
             clearances = query.check(q[None])
             if not clearances.free[0]:
-                near = with_search_starts(robot.description, targets)
-                free = resolve_single(self.finder, near, query, q)
+                search_targets = with_search_starts(robot.description, targets)
+                free = resolve_single(self.finder, search_targets, query, q)
                 if free is None:
                     return None
                 q, verdict, clearances = free
@@ -334,7 +334,7 @@ class Engine:
                 if recorder is not None and trace_format is not None:
                     background.do(partial(part.record, recorder, trace_format))
                 batches.append(part.batch)
-        return BatchSolution.joined(batches)
+        return BatchSolution.concatenate(batches)
 
     def solve_blocks(
         self,
@@ -393,12 +393,12 @@ class Engine:
                     solutions[row] = BatchSolution.invalid(1, *template)
                     ranges = (row + 1, stop), (start, row)
                     pending += [(first, last) for first, last in ranges if first < last]
-            solution = BatchSolution.joined([solutions[start] for start in sorted(solutions)])
+            solution = BatchSolution.concatenate([solutions[start] for start in sorted(solutions)])
             yield SolvedBlock(first_row, solution, dict(sorted(faults.items())))
             first_row += count
 
     def _parts(
-        self, targets: TargetBatch, options: SolveOptions, known: Outcome | None
+        self, targets: TargetBatch, options: SolveOptions, first_outcome: Outcome | None
     ) -> Iterator[SolvedPart]:
         """Yield the parts of the batch in order: solved concurrently, checked and diagnosed."""
         trace = options.recorder is not None
@@ -407,18 +407,18 @@ class Engine:
 
         def solve(rows: slice) -> SolvedPart:
             started, part = time.time_ns(), targets.rows(rows)
-            near = with_search_starts(self.robot.description, part)
-            outcome = known or self._run(near, trace)
+            search_targets = with_search_starts(self.robot.description, part)
+            outcome = first_outcome or self._run(search_targets, trace)
             if outcome.rows is not None:
                 parts.adapt_to_memory(len(outcome.q), outcome.rows.nbytes)
             query = self.collision_query(part)
             if query is None and targets.prefer == MANIPULABILITY:
-                outcome = self._maximise_manipulability(near, outcome)
+                outcome = self._maximise_manipulability(search_targets, outcome)
             batch = judge_outcome(self.robot, self.method.name, part, outcome, query)
             if query is not None and self.hand_search is not None:
                 batch = resolve_collisions(
                     lambda group: self.engine_for(group).finder,
-                    near,
+                    search_targets,
                     query,
                     outcome,
                     batch,
@@ -426,7 +426,7 @@ class Engine:
                 )
                 outcome = replace(outcome, q=batch.q, time=batch.time)
             if options.diagnose:
-                batch = self._diagnose(near, outcome, batch)
+                batch = self._diagnose(search_targets, outcome, batch)
                 if self.check is not None and len(targets) == 1:
                     batch = add_collision_remedies(
                         lambda changed: self.solve(changed, SolveOptions()).success,
@@ -435,7 +435,7 @@ class Engine:
                         batch,
                     )
             if (best_effort := BestEffort.of(options.best_effort)) is not None:
-                batch = self._replace_by_nearest(near, outcome, batch, query, best_effort)
+                batch = self._replace_by_nearest(search_targets, outcome, batch, query, best_effort)
             q = in_nearest_turns(self.robot.description, part, batch.q)
             batch = replace(batch, q=q)
             parts.adapt_to_time(1e-9 * (time.time_ns() - started))

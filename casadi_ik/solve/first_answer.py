@@ -1,10 +1,10 @@
 """Interim solutions from CasADi's virtual machine while the C code is compiled in the background.
 
-A separate process compiles into the cache, so that later programs find the library as well. It ends
-by itself, and leaves no incomplete library if it is killed. The virtual machine computes the
-solution of the first restart of the compiled code, up to the last digits of sines and arctangents.
-A target that this restart does not solve waits for the compiler, so a solution does not depend on
-the time of the call.
+A separate process compiles into the cache, so that later programs find the library too. It ends
+after the compilation, and leaves no incomplete library if it is killed. The virtual machine
+computes the solution of the first restart of the compiled code, up to the last digits of sines and
+arctangents. A target that this restart does not solve waits for the compiler, so a solution does
+not depend on the time of the call.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class BackgroundCompilation:
     """Settings of the compilation in the background.
 
     Attributes:
-        poll_interval: Time between two looks for the library [s].
+        poll_interval: Interval between two searches for the library [s].
         lifetime: Maximum lifetime of the process [s].
         seconds_per_motor: Approximate compile time per motor [s]. Source: gcc 12, one core of a
             server of 2023.
@@ -106,11 +106,11 @@ class InterimSolver:
     def _is_ready(self, method: HandSearch) -> bool:
         """Return whether to use the compiled method, waiting for the compiler if necessary."""
         with self._lock:
-            process, now = self._process, time.monotonic()
+            process, poll_time = self._process, time.monotonic()
             interval = BACKGROUND_COMPILATION.poll_interval
-            if process is not None and now - self._last_poll < interval:
+            if process is not None and poll_time - self._last_poll < interval:
                 return False
-            self._last_poll = now
+            self._last_poll = poll_time
             try:
                 with cached_only():
                     method.prepare()
@@ -132,7 +132,7 @@ def start_compilation(method: HandSearch) -> subprocess.Popen[bytes] | None:
     if not Path(sys.executable or "").name.startswith("python") or find_compiler() is None:
         return None
     package = Path(__file__).parents[2]
-    # Its own process group, so that Ctrl-C does not end the compilation.
+    # A separate process group, so that Ctrl-C does not end the compilation.
     flags = subprocess.CREATE_NO_WINDOW if sys.platform == "win32" else 0
     try:
         process = subprocess.Popen(

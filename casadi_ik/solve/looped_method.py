@@ -61,17 +61,17 @@ class LoopedMethod(ABC):
     """Phases in which the arm's part of q is undefined; the arm Jacobian is not measured there."""
 
     follows_closed_chain: bool = False
-    """Whether a log measures the closed chain of arm and thumb, along which the method moves."""
+    """True if the method moves along the closed chain of arm and thumb; a log then measures it."""
 
     max_iterations: int = 100_000
-    """Maximum number of iterations of a start. The default exceeds what any step with its own
-    stopping rule uses."""
+    """Maximum number of iterations of a start. The default exceeds the iterations of any step
+    with a stopping rule."""
 
     takes_free_contacts: bool = False
-    """Whether a finger or its normal may be free."""
+    """True if a finger or its normal may be free."""
 
     takes_fixed_actuators: bool = False
-    """Whether actuators may be fixed."""
+    """True if actuators may be fixed."""
 
     def __init__(self, robot: RobotDescription, options: Any, compiled: bool = True) -> None:
         """Store the arguments; the loop is built when first needed.
@@ -108,7 +108,7 @@ class LoopedMethod(ABC):
 
     @property
     def hand_search(self) -> HandSearch | None:
-        """None: the method is a black box, see `Method.hand_search`."""
+        """Hand search of the method; None, because it is a black box. See `Method.hand_search`."""
         return None
 
     @property

@@ -53,7 +53,7 @@ class Outcome:
         rows: NDArray[np.intp],
         q: Array,
         improved: NDArray[np.bool_],
-        other: Outcome,
+        second: Outcome,
         trace: Sequence[NDArray[Any]] | None,
     ) -> Outcome:
         """Return the outcome after a second search for some of its targets.
@@ -62,33 +62,33 @@ class Outcome:
             rows: (m,) the targets.
             q: (m, n) configurations reached by the second search.
             improved: (m,) True where they replace those of the first search.
-            other: The second search; its iterations, restarts and seconds are added.
+            second: The second search; its iterations, restarts and seconds are added.
             trace: Its records by target, as records of this outcome; None if no trace is kept.
         """
-        every = self.q.copy()
-        every[rows[improved]] = q[improved]
+        all_q = self.q.copy()
+        all_q[rows[improved]] = q[improved]
 
-        def total(first: NDArray[Any], second: NDArray[Any]) -> NDArray[Any]:
-            added = first.copy()
-            added[rows] += second
-            return added
+        def total(counts: NDArray[Any], second_counts: NDArray[Any]) -> NDArray[Any]:
+            sums = counts.copy()
+            sums[rows] += second_counts
+            return sums
 
         records = None
         if trace is not None and self.rows is not None:
             parts = [[part] for part in self.trace]
-            for row, second in zip(rows.tolist(), trace, strict=True):
-                parts[row].append(second)
-            records = np.concatenate([part for both in parts for part in both])
+            for row, second_part in zip(rows.tolist(), trace, strict=True):
+                parts[row].append(second_part)
+            records = np.concatenate([part for target_parts in parts for part in target_parts])
         phases = {
-            name: total(count, other.phases[name]) if name in other.phases else count
+            name: total(count, second.phases[name]) if name in second.phases else count
             for name, count in self.phases.items()
         }
         return replace(
             self,
-            q=every,
-            iterations=total(self.iterations, other.iterations),
-            restarts=total(self.restarts, other.restarts),
-            time=total(self.time, other.time),
+            q=all_q,
+            iterations=total(self.iterations, second.iterations),
+            restarts=total(self.restarts, second.restarts),
+            time=total(self.time, second.time),
             phases=phases,
             rows=records,
         )
@@ -191,7 +191,7 @@ class Method(Protocol):
         """The method as a search over hand postures, or None if it is a black box.
 
         The engine needs it for alternatives, collision-free search, palm targets, `fast` and
-        interim solutions. Diagnoses of other methods build a hand-first search of their own.
+        interim solutions. Diagnoses of other methods build a separate hand-first search.
         """
         return None
 
@@ -202,7 +202,7 @@ class Method(Protocol):
 
     @property
     def parameters(self) -> Mapping[str, Any]:
-        """All parameters of the method, for the log."""
+        """Parameters of the method by name, for the log."""
         ...
 
     def prepare(self) -> None:
@@ -338,7 +338,11 @@ class HandSearch(Method, Protocol):
         ...
 
     def prepare(self, batches: bool = False) -> None:
-        """Build and compile what a single target needs, and with `batches` what a batch needs."""
+        """Build and compile the kernels of a single target.
+
+        Args:
+            batches: Whether to also compile the kernels of batches.
+        """
         ...
 
     def in_virtual_machine(self) -> HandSearch:

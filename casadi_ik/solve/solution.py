@@ -357,7 +357,7 @@ class BatchSolution(ReprMixin):
         return len(self.q)
 
     @classmethod
-    def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
+    def concatenate(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
         """Concatenate batches, at least one.
 
         A phase that is missing in a batch has 0 iterations there.
@@ -383,6 +383,12 @@ class BatchSolution(ReprMixin):
             for name in ("diagnoses", "closest", "collisions")
         }
         return replace(first, **arrays, phases=phases, **tuples)
+
+    @classmethod
+    def joined(cls, parts: Sequence[BatchSolution]) -> BatchSolution:
+        """Concatenate batches; deprecated name of `concatenate`."""
+        warn_renamed("BatchSolution.joined", "BatchSolution.concatenate")
+        return cls.concatenate(parts)
 
     @property
     def status_names(self) -> NDArray[np.str_]:

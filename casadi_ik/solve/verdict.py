@@ -102,7 +102,7 @@ class PalmVerdicts:
     angle_error: Array
     ok: NDArray[np.bool_]
 
-    def of(self, row: int) -> PalmVerdict:
+    def row(self, row: int) -> PalmVerdict:
         """Return the verdict of a row."""
         errors = float(self.position_error[row]), float(self.angle_error[row])
         return PalmVerdict(*errors, bool(self.ok[row]))
@@ -120,7 +120,7 @@ class Verdict:
 
     @property
     def all_ok(self) -> NDArray[np.bool_]:
-        """(k,) whether every contact is within tolerance; for palm targets, the palm pose.
+        """(k,) True if every contact is within tolerance; for palm targets, if the palm pose is.
 
         The contacts of a palm target are derived from its palm pose and the hand posture. Their
         errors are reported, but only the palm pose is required.
@@ -144,7 +144,7 @@ class Verdict:
         return contact_verdicts(fingers, tolerances, *errors)
 
     def solved(self, limits: bool) -> NDArray[np.bool_]:
-        """Return (k,) whether the target is solved, and q within limits if `limits`."""
+        """Return (k,) True if the target is solved, and q is within limits if `limits`."""
         return self.all_ok & self.limits_ok if limits else self.all_ok
 
 

@@ -78,7 +78,7 @@ def join_blocks(blocks: list[SolveBlock]) -> SolveBlock:
             points=np.concatenate([block.targets.points for block in blocks]),
             normals=np.concatenate([block.targets.normals for block in blocks]),
         ),
-        batch=ik.BatchSolution.joined([block.batch for block in blocks]),
+        batch=ik.BatchSolution.concatenate([block.batch for block in blocks]),
         rows=np.concatenate([block.rows for block in blocks]),
         started=np.concatenate([block.started for block in blocks]),
     )
