@@ -36,11 +36,11 @@ from casadi_ik.export.single import (
 )
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
-from casadi_ik.kinematics.contacts import point_normal_kinds
+from casadi_ik.kinematics.contacts import LENGTH, point_normal_kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.motion import recovery
-from casadi_ik.motion.cycle import Cycle
-from casadi_ik.motion.follower import PALM_WEIGHT
+from casadi_ik.motion.cycle import CYCLE_TUNING, Cycle
+from casadi_ik.motion.follower import PALM_WEIGHT, RETURN_SHARE
 from casadi_ik.motion.free_path import motor_units
 from casadi_ik.motion.inputs import ERROR_TIME, contact_weights
 from casadi_ik.motion.motion import RUN_UP, own_velocities
@@ -127,6 +127,7 @@ class FollowSources:
             "N_MOTORS": len(robot.actuators),
             "MOVES_PALM": int(bool(cycle.palms)),
             "TRAIL_CAPACITY": recovery.CAPACITY,
+            "N_RESIDUALS": cycle.state.slice("residual").stop - cycle.state.slice("residual").start,
         }
         integers |= _field_offsets("STATE", cycle.state) | _field_offsets(
             "PARAMETER", cycle.parameters
@@ -138,6 +139,9 @@ class FollowSources:
             "PULL": FOLLOWING_PULL,
             "RUN_UP": RUN_UP,
             "PALM_WEIGHT": PALM_WEIGHT,
+            "LENGTH": LENGTH,
+            "BRAKING_SHARE": CYCLE_TUNING.braking_share,
+            "RETURN_SHARE": RETURN_SHARE,
             "TRAIL_SPACING": recovery.SPACING,
             "TRAIL_CHECK_PERIOD": recovery.CHECK_PERIOD,
             "TRAIL_PATIENCE": recovery.PATIENCE,

@@ -168,6 +168,67 @@ def test_return_path_matches_python(robot, project):
     assert status[-1] == 1
 
 
+CLUTCH_PROGRAM = """
+#include <stdio.h>
+#include "arm.h"
+static arm_follower follower;
+int main(void) { /* q0; measured q; then by cycle: points, normals, palm */
+  double q0[ARM_MOTORS], measured[ARM_MOTORS], row[6 * ARM_FINGERS + 12];
+  int i, cycle;
+  if (fread(q0, sizeof q0, 1, stdin) != 1) return 2;
+  if (fread(measured, sizeof measured, 1, stdin) != 1) return 2;
+  if (arm_follow_from(&follower, q0, PERIOD, 0, 0)) return 3;
+  for (cycle = 0; fread(row, sizeof row, 1, stdin) == 1; ++cycle) {
+    if (cycle == 50) arm_pause(&follower);
+    if (cycle == 150 && arm_resume(&follower, 0)) return 4;
+    if (cycle == 250 && arm_resume(&follower, measured)) return 4;
+    if (cycle == 300 && arm_follow_posture(&follower, q0)) return 4;
+    printf("%d", arm_follow(&follower, row, row + 3 * ARM_FINGERS, row + 6 * ARM_FINGERS));
+    for (i = 0; i < ARM_MOTORS; ++i) printf(" %a", follower.q[i]);
+    puts("");
+  }
+  return 0;
+}
+"""
+
+
+@needs_gcc
+def test_clutch_matches_python(robot, project):
+    """The measured posture is beyond a limit; the targets leap at the pauses."""
+    program = built(project, "clutch", CLUTCH_PROGRAM, "arm_follow", "-O1", *SANITIZERS)
+    share = np.linspace(0, 1, 600)[:, None]
+    path = robot.home + 0.1 * share * np.sin(np.arange(14))
+    points, normals = robot.contacts(path)
+    points[100:200] += 0.3
+    points[200:] -= 0.5
+    normals[200:] = -normals[200:, :, [1, 2, 0]]
+    poses = robot.palm(path)
+    measured = path[250].copy()
+    measured[3] = robot.lower[3] - 0.05
+    measured[8] += 0.1
+    start = path[0].copy()
+    start[1] = robot.upper[1] + 0.02
+    rows = [points.reshape(600, -1), normals.reshape(600, -1), poses[:, :3, :3].reshape(600, -1)]
+    rows = np.hstack([*rows, poses[:, :3, 3]])
+    status, q = run_program(program, start, measured, rows)
+    follower = ik.Solver(robot).follow(start, PERIOD)
+    names = ("HOLDING", "FOLLOWING", "LATE", "MISSED")
+    for cycle in range(600):
+        if cycle == 50:
+            follower.pause()
+        if cycle == 150:
+            follower.resume()
+        if cycle == 250:
+            follower.resume(measured)
+        if cycle == 300:
+            follower.posture = start
+        expected = follower(points[cycle], normals[cycle], poses[cycle])
+        np.testing.assert_allclose(q[cycle], expected, atol=1e-9, err_msg=f"cycle {cycle}")
+        assert names[status[cycle]] == follower.state.status.name, cycle
+    assert status[50:150] == [0] * 100
+    assert ((q[-1] >= robot.lower) & (q[-1] <= robot.upper)).all()
+
+
 @needs_gcc
 def test_palms_match_python(robot, project):
     program = built(project, "palms", PALMS, "*", "-O0", "-Isrc")

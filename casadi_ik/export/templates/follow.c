@@ -89,6 +89,17 @@ static int set_palm(@PREFIX@_follower *follower, const double *palm) {
 #endif
 }
 
+/* Computes the positions at which the motors can stop. */
+static void posture_at_rest(const @PREFIX@_follower *follower, double *q) {
+  int i;
+  for (i = 0; i < N_MOTORS; ++i) {
+    const double last_step = follower->state[STATE_LAST_STEP + i], change = follower->max_change[i];
+    const double speed = fabs(last_step), steps = floor(speed / change);
+    const double stopping_distance = speed * steps - change * steps * (steps + 1) / 2;
+    q[i] = follower->state[STATE_Q + i] + (last_step < 0 ? -stopping_distance : stopping_distance);
+  }
+}
+
 /* Removes the target: the motors decelerate to rest. */
 static void clear_target(@PREFIX@_follower *follower) {
   double *state = follower->state;
@@ -99,12 +110,7 @@ static void clear_target(@PREFIX@_follower *follower) {
   }
   memset(follower->parameters + PARAMETER_WEIGHTS, 0, 2 * N_FINGERS * sizeof(double));
   (void) set_palm(follower, 0);
-  for (i = 0; i < N_MOTORS; ++i) {
-    const double last_step = state[STATE_LAST_STEP + i], change = follower->max_change[i];
-    const double speed = fabs(last_step), steps = floor(speed / change);
-    const double stopping_distance = speed * steps - change * steps * (steps + 1) / 2;
-    state[STATE_GOAL + i] = state[STATE_Q + i] + (last_step < 0 ? -stopping_distance : stopping_distance);
-  }
+  posture_at_rest(follower, state + STATE_GOAL);
   state[STATE_LOCKED_ON] = 0.0;
 }
 
@@ -123,6 +129,128 @@ static int compute_step_from_rest(@PREFIX@_follower *follower, const double *q) 
   copy(state + STATE_Q, q, N_MOTORS);
   copy(state + STATE_GOAL, q, N_MOTORS);
   return compute_step(follower, state);
+}
+
+/* Computes the contacts and the palm of a posture: the residual of a target at the origin. */
+static void measure(@PREFIX@_follower *follower, const double *q, double *residual) {
+  double parameters[sizeof follower->parameters / sizeof(double)];
+  double record[sizeof follower->record / sizeof(double)];
+  int i;
+  memcpy(parameters, follower->parameters, sizeof parameters);
+  memcpy(record, follower->record, sizeof record);
+  for (i = 0; i < 2 * N_FINGERS; ++i) follower->parameters[PARAMETER_WEIGHTS + i] = 1.0;
+  for (i = 0; i < N_FINGERS; ++i) {
+    memset(follower->parameters + PARAMETER_POINTS + 3 * i, 0, 3 * sizeof(double));
+    copy(follower->parameters + PARAMETER_NORMALS + 3 * i, (const double[]){1.0, 0.0, 0.0}, 3);
+  }
+#if MOVES_PALM
+  memset(follower->parameters + PARAMETER_PALM_POINT, 0, 3 * sizeof(double));
+  memset(follower->parameters + PARAMETER_PALM_AXES, 0, 9 * sizeof(double));
+  follower->parameters[PARAMETER_PALM_WEIGHT] = follower->parameters[PARAMETER_PALM_WEIGHT + 1] = 1.0;
+#endif
+  copy(follower->parameters + PARAMETER_LOWER, q, N_MOTORS);
+  copy(follower->parameters + PARAMETER_UPPER, q, N_MOTORS);
+  (void) compute_step_from_rest(follower, q);
+  copy(residual, follower->new_state + STATE_RESIDUAL, N_RESIDUALS);
+  memcpy(follower->parameters, parameters, sizeof parameters);
+  memcpy(follower->record, record, sizeof record);
+}
+
+/* Computes the smallest rotation that turns a vector into the direction of another. */
+static void turn_between(const double *a, const double *b, double *turn) {
+  const double length = sqrt((a[0] * a[0] + a[1] * a[1] + a[2] * a[2]) * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2]));
+  const double cosine = (a[0] * b[0] + a[1] * b[1] + a[2] * b[2]) / length;
+  double v[3] = {(a[1] * b[2] - a[2] * b[1]) / length, (a[2] * b[0] - a[0] * b[2]) / length,
+                 (a[0] * b[1] - a[1] * b[0]) / length};
+  const int opposite = cosine < -1 + 1e-12;
+  int i, k;
+  if (opposite) {
+    const int least = fabs(a[0]) <= fabs(a[1]) && fabs(a[0]) <= fabs(a[2]) ? 0 : fabs(a[1]) <= fabs(a[2]) ? 1 : 2;
+    const double e[3] = {least == 0, least == 1, least == 2};
+    const double x = a[1] * e[2] - a[2] * e[1], y = a[2] * e[0] - a[0] * e[2], z = a[0] * e[1] - a[1] * e[0];
+    const double size = sqrt(x * x + y * y + z * z);
+    v[0] = x / size;
+    v[1] = y / size;
+    v[2] = z / size;
+  }
+  for (i = 0; i < 3; ++i) {
+    for (k = 0; k < 3; ++k) {
+      const double product = v[i] * v[k];
+      turn[3 * i + k] = opposite ? 2 * product - (i == k) : product / (1 + cosine) + (i == k ? cosine : 0.0);
+    }
+  }
+  if (opposite) return;
+  turn[1] -= v[2];
+  turn[2] += v[1];
+  turn[3] += v[2];
+  turn[5] -= v[0];
+  turn[6] -= v[1];
+  turn[7] += v[0];
+}
+
+/* Displaces the target as since the clutch was closed; anchors targets that are new. */
+static void displace(@PREFIX@_follower *follower) {
+  double *parameters = follower->parameters, *weights = parameters + PARAMETER_WEIGHTS;
+  int i, k, is_new = 0;
+  for (i = 0; i < N_FINGERS; ++i) {
+    is_new |= weights[2 * i] > 0 && !follower->has_offset[i];
+    is_new |= weights[2 * i + 1] > 0 && !follower->has_turn[i];
+  }
+#if MOVES_PALM
+  is_new |= parameters[PARAMETER_PALM_WEIGHT] > 0 && !follower->has_palm;
+#endif
+  if (is_new) {
+    double q[N_MOTORS], residual[N_RESIDUALS];
+    posture_at_rest(follower, q);
+    measure(follower, q, residual);
+    for (i = 0; i < N_FINGERS; ++i) {
+      const double *point = parameters + PARAMETER_POINTS + 3 * i, *normal = parameters + PARAMETER_NORMALS + 3 * i;
+      if (weights[2 * i] > 0 && !follower->has_offset[i]) {
+        for (k = 0; k < 3; ++k) follower->offsets[i][k] = LENGTH * residual[3 * i + k] - point[k];
+        follower->has_offset[i] = 1;
+      }
+      if (weights[2 * i + 1] > 0 && !follower->has_turn[i]) {
+        const double *row = residual + 3 * N_FINGERS + 3 * i;
+        turn_between(normal, (const double[]){row[0] + 1.0, row[1], row[2]}, follower->turns[i]);
+        follower->has_turn[i] = 1;
+      }
+    }
+#if MOVES_PALM
+    if (parameters[PARAMETER_PALM_WEIGHT] > 0 && !follower->has_palm) {
+      const double *palm = residual + N_RESIDUALS - 12, *axes = parameters + PARAMETER_PALM_AXES;
+      int row;
+      for (row = 0; row < 3; ++row) {
+        follower->palm_offset[row] = LENGTH * palm[row] - parameters[PARAMETER_PALM_POINT + row];
+        for (k = 0; k < 3; ++k) {
+          follower->palm_turn[3 * row + k] = axes[row] * palm[3 + 3 * k] + axes[3 + row] * palm[3 + 3 * k + 1]
+                                             + axes[6 + row] * palm[3 + 3 * k + 2];
+        }
+      }
+      follower->has_palm = 1;
+    }
+#endif
+  }
+  for (i = 0; i < N_FINGERS; ++i) {
+    double *point = parameters + PARAMETER_POINTS + 3 * i, *normal = parameters + PARAMETER_NORMALS + 3 * i;
+    const double *turn = follower->turns[i], n[3] = {normal[0], normal[1], normal[2]};
+    for (k = 0; k < 3; ++k) {
+      if (weights[2 * i] > 0) point[k] += follower->offsets[i][k];
+      if (weights[2 * i + 1] > 0) normal[k] = turn[3 * k] * n[0] + turn[3 * k + 1] * n[1] + turn[3 * k + 2] * n[2];
+    }
+  }
+#if MOVES_PALM
+  if (parameters[PARAMETER_PALM_WEIGHT] > 0) {
+    double axes[9], *target = parameters + PARAMETER_PALM_AXES;
+    const double *turn = follower->palm_turn;
+    copy(axes, target, 9);
+    for (i = 0; i < 3; ++i) {
+      parameters[PARAMETER_PALM_POINT + i] += follower->palm_offset[i];
+      for (k = 0; k < 3; ++k) {
+        target[3 * i + k] = axes[3 * i] * turn[k] + axes[3 * i + 1] * turn[3 + k] + axes[3 * i + 2] * turn[6 + k];
+      }
+    }
+  }
+#endif
 }
 
 /* Recovery of a follower that is stuck, as in motion/recovery.py; all lines count as free.
@@ -157,7 +285,7 @@ static void next_step(@PREFIX@_follower *follower, double *step) {
   const double *state = follower->state;
   double limit, share;
   int i;
-  if (!recovery->has_line) {
+  if (follower->is_paused || !recovery->has_line) {
     for (i = 0; i < N_MOTORS; ++i) {
       const double last_step = state[STATE_LAST_STEP + i];
       const double speed = fmax(fabs(last_step) - follower->max_change[i], 0.0);
@@ -283,9 +411,27 @@ static void update_recovery(@PREFIX@_follower *follower) {
   }
 }
 
+/* Sets bounds that lead motors beyond their limits back to them. */
+static void return_to_limits(@PREFIX@_follower *follower) {
+  double *parameters = follower->parameters;
+  int i;
+  follower->is_beyond_limits = 0;
+  for (i = 0; i < N_MOTORS; ++i) {
+    const double q = follower->state[STATE_Q + i], change = BRAKING_SHARE * follower->max_change[i];
+    const double way = fmin(fmax(q, LOWER[i]), UPPER[i]) - q, direction = (way > 0) - (way < 0);
+    const double step = fmin(fmax(direction * follower->state[STATE_LAST_STEP + i], 0.0) + change,
+                             RETURN_SHARE * parameters[PARAMETER_MAX_STEP + i]);
+    const double next = q + direction * fmin(step, brake(fabs(way), change));
+    parameters[PARAMETER_LOWER + i] = fmin(LOWER[i], next);
+    parameters[PARAMETER_UPPER + i] = fmax(UPPER[i], next);
+    follower->is_beyond_limits |= way != 0;
+  }
+}
+
 /* Makes a step; returns 0, with the state unchanged, if a number is out of range. */
 static int step(@PREFIX@_follower *follower) {
-  if (follower->recovery.is_returning) {
+  if (follower->is_beyond_limits) return_to_limits(follower);
+  if (follower->is_paused || follower->recovery.is_returning) {
     double motor_steps[N_MOTORS], q[N_MOTORS];
     int i;
     next_step(follower, motor_steps);
@@ -312,6 +458,43 @@ static int is_met(const @PREFIX@_follower *follower, int position, int angle) {
   return met;
 }
 
+/* Restarts at rest at q, which may be beyond the limits. */
+static void restart(@PREFIX@_follower *follower, const double *q) {
+  @PREFIX@_recovery *recovery = &follower->recovery;
+  int i;
+  memset(follower->state, 0, sizeof follower->state);
+  for (i = 0; i < N_MOTORS; ++i) {
+    follower->q[i] = follower->state[STATE_Q + i] = follower->state[STATE_GOAL + i] = q[i];
+    recovery->trail[0][i] = fmin(fmax(q[i], LOWER[i]), UPPER[i]);
+  }
+  follower->state[STATE_LOCKED_ON] = 1.0;
+  follower->is_beyond_limits = 1;
+  recovery->count = recovery->cycles_to_check = 1;
+  recovery->has_met = recovery->destination = 0;
+  follow_contacts(recovery);
+}
+
+void @PREFIX@_pause(@PREFIX@_follower *follower) { follower->is_paused = 1; }
+
+int @PREFIX@_follow_posture(@PREFIX@_follower *follower, const double *q) {
+  int i;
+  if (!are_finite(q, N_MOTORS)) return @GUARD@_BAD_INPUT;
+  for (i = 0; i < N_MOTORS; ++i) follower->parameters[PARAMETER_POSTURE + i] = fmin(fmax(q[i], LOWER[i]), UPPER[i]);
+  return 0;
+}
+
+int @PREFIX@_resume(@PREFIX@_follower *follower, const double *q) {
+  double q_rest[N_MOTORS];
+  if (q && !are_finite(q, N_MOTORS)) return @GUARD@_BAD_INPUT;
+  if (q) restart(follower, q);
+  follower->is_paused = follower->has_palm = 0;
+  follower->is_relative = 1;
+  memset(follower->has_offset, 0, sizeof follower->has_offset);
+  memset(follower->has_turn, 0, sizeof follower->has_turn);
+  posture_at_rest(follower, q_rest);
+  return @PREFIX@_follow_posture(follower, q_rest);
+}
+
 int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double period,
                          const double *velocity, const double *acceleration) {
   double *parameters = follower->parameters;
@@ -330,17 +513,13 @@ int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double p
   for (i = 0; i < N_MOTORS; ++i) {
     const double max_velocity = velocity ? velocity[i] : VELOCITY[i];
     const double max_acceleration = acceleration ? acceleration[i] : max_velocity / RUN_UP;
-    double q = q0 ? q0[i] : HOME[i];
+    const double q = q0 ? q0[i] : HOME[i];
     is_valid &= is_finite(q) && is_finite(max_velocity) && max_velocity > 0 && is_finite(max_acceleration)
                 && max_acceleration > 0;
     parameters[PARAMETER_POSTURE + i] = q;
-    q = q > LOWER[i] ? q : LOWER[i];
-    q = q < UPPER[i] ? q : UPPER[i];
     parameters[PARAMETER_MAX_STEP + i] = max_velocity * period;
     parameters[PARAMETER_MAX_CHANGE + i] = follower->max_change[i] = max_acceleration * (period * period);
-    follower->q[i] = follower->state[STATE_Q + i] = follower->state[STATE_GOAL + i] = q;
   }
-  follower->state[STATE_LOCKED_ON] = 1.0;
   for (i = 0; i < N_MOTORS; ++i) {
     const double longest = parameters[PARAMETER_MAX_STEP + i] / UNITS[i];
     follower->recovery.longest_step = fmax(follower->recovery.longest_step, longest);
@@ -350,16 +529,15 @@ int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double p
       is_valid ? (int64_t) fmax(fmin(floor(TRAIL_CHECK_PERIOD / period), 1e9), 1.0) : 1;
   follower->recovery.comparisons =
       is_valid ? (int64_t) fmin(ceil(TRAIL_CAPACITY * period / TRAIL_SEARCH_TIME), TRAIL_CAPACITY) : 0;
-  copy(follower->recovery.trail[0], follower->q, N_MOTORS);
-  follower->recovery.count = follower->recovery.cycles_to_check = 1;
-  follower->recovery.has_met = 0;
-  follow_contacts(&follower->recovery);
+  restart(follower, q0 ? q0 : HOME);
   return is_valid ? 0 : @GUARD@_BAD_INPUT;
 }
 
 int @PREFIX@_follow(@PREFIX@_follower *follower, const double *points, const double *normals,
                     const double *palm) {
-  int i, is_valid = set_contacts(follower, points, normals) && set_palm(follower, palm) && step(follower);
+  int i, is_valid = !follower->is_paused && set_contacts(follower, points, normals) && set_palm(follower, palm);
+  if (is_valid && follower->is_relative) displace(follower);
+  is_valid = is_valid && step(follower);
   if (!is_valid) {
     follow_contacts(&follower->recovery);
     clear_target(follower);

@@ -139,5 +139,15 @@ export class Solver {
     positionError: Float64Array;
     angleError: Float64Array;
   };
+  /** Opens the clutch: the motors decelerate to rest, and targets are ignored. */
+  pause(): void;
+  /**
+   * Closes the clutch: the robot moves as the targets move from now on.
+   * @param q Measured positions of the motors at rest; they may be beyond their limits. Omitted: the
+   * commanded ones.
+   */
+  resume(q?: ArrayLike<number> | null): void;
+  /** Sets the posture to which free motions lead, such as one with a preferred elbow. */
+  followPosture(q: ArrayLike<number>): void;
 @}@
 }

@@ -185,7 +185,7 @@ void @PREFIX@_shapes(@PREFIX@_solver *solver, const @REAL@ *q, @REAL@ *poses);
 
 /* Status of a cycle of a follower. */
 enum {
-  @GUARD@_HOLDING = 0,   /* invalid frame: the motors decelerate to rest and wait */
+  @GUARD@_HOLDING = 0,   /* invalid frame, or paused: the motors decelerate to rest and wait */
   @GUARD@_FOLLOWING = 1, /* all contacts are within tolerance */
   @GUARD@_LATE = 2,      /* velocity and acceleration limits delay the motors */
   @GUARD@_MISSED = 3     /* no configuration on this branch meets the contacts */
@@ -209,12 +209,16 @@ typedef struct {
   double state[@FOLLOW_STATE@], new_state[@FOLLOW_STATE@];
   double parameters[@FOLLOW_PARAMETERS@], record[@FOLLOW_RECORD@];
   @PREFIX@_recovery recovery;
+  double offsets[@GUARD@_FINGERS][3], turns[@GUARD@_FINGERS][9], palm_offset[3], palm_turn[9];
+  int64_t has_offset[@GUARD@_FINGERS], has_turn[@GUARD@_FINGERS], has_palm;
+  int64_t is_paused, is_relative, is_beyond_limits;
 } @PREFIX@_follower;
 
 /* Starts at rest at q0, or at home if that is a null pointer. period is the time between two cycles
  * [s]. velocity and acceleration are limits of the motors; null pointers select the velocities of the
- * robot's description, and accelerations that reach them from rest in a quarter of a second. Returns
- * 0, or @GUARD@_BAD_INPUT if a value is not finite or not positive; the follower is unusable then. */
+ * robot's description, and accelerations that reach them from rest in a quarter of a second. Motors beyond
+ * their limits return to them at a fifth of their velocity limits. Returns 0, or @GUARD@_BAD_INPUT if a
+ * value is not finite or not positive; the follower is unusable then. */
 int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double period,
                          const double *velocity, const double *acceleration);
 
@@ -224,6 +228,19 @@ int @PREFIX@_follow_from(@PREFIX@_follower *follower, const double *q0, double p
  * An invalid frame is not an error; its status is @GUARD@_HOLDING. Collisions are not checked. */
 int @PREFIX@_follow(@PREFIX@_follower *follower, const double *points, const double *normals,
                     const double *palm);
+
+/* Opens the clutch: the motors decelerate to rest, and targets are ignored. */
+void @PREFIX@_pause(@PREFIX@_follower *follower);
+
+/* Closes the clutch: the next points, normals and palm are anchored to the robot, so that it does not
+ * move before the target does, and then moves as the target does. q are measured positions of the motors
+ * at rest, which may be beyond their limits; a null pointer selects the commanded ones. They are the
+ * posture of free motions from then on. Returns 0, or @GUARD@_BAD_INPUT if a number is not finite. */
+int @PREFIX@_resume(@PREFIX@_follower *follower, const double *q);
+
+/* Sets the posture to which free motions lead, such as one with a preferred elbow. Returns 0, or
+ * @GUARD@_BAD_INPUT if a number is not finite. */
+int @PREFIX@_follow_posture(@PREFIX@_follower *follower, const double *q);
 @}@
 
 #ifdef __cplusplus

@@ -181,6 +181,18 @@ export class Solver {
       angleError: results.slice(2 * n + f),
     };
   }
+
+  pause() { this._wasm.pause(); }
+
+  resume(q) {
+    if (q) filled(this._q0, q, "q");
+    if (this._wasm.resume(q ? 1 : 0)) throw new RangeError("resume: expected finite numbers");
+  }
+
+  followPosture(q) {
+    filled(this._q0, q, "q");
+    if (this._wasm.follow_posture()) throw new RangeError("followPosture: expected finite numbers");
+  }
 @}@
 
   _ask(points, normals, q0) {

@@ -97,6 +97,9 @@ EXPORTED(rates_at) double *rates_at(void);
 EXPORTED(followed_at) double *followed_at(void);
 EXPORTED(follow_from) int follow_from(int has_q0, double period, int has_velocity, int has_acceleration);
 EXPORTED(follow) int follow(int has_palm);
+EXPORTED(pause) void pause(void);
+EXPORTED(resume) int resume(int has_q);
+EXPORTED(follow_posture) int follow_posture(void);
 
 /* Returns the array of velocity limits, then acceleration limits. */
 double *rates_at(void) { return rates; }
@@ -107,4 +110,7 @@ int follow_from(int has_q0, double period, int has_velocity, int has_acceleratio
                               has_acceleration ? rates + @GUARD@_MOTORS : 0);
 }
 int follow(int has_palm) { return @PREFIX@_follow(&follower, points, normals, has_palm ? palm : 0); }
+void pause(void) { @PREFIX@_pause(&follower); }
+int resume(int has_q) { return @PREFIX@_resume(&follower, has_q ? q0 : 0); }
+int follow_posture(void) { return @PREFIX@_follow_posture(&follower, q0); }
 @}@
