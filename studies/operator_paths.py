@@ -61,7 +61,7 @@ branch, and because its velocities are limited. *Time*: of one cycle.
 
 @dataclass(frozen=True)
 class Part:
-    """One path.
+    """Path of one robot.
 
     Attributes:
         robot: Name of the robot.
