@@ -1,4 +1,4 @@
-"""Tests of studies are slow tests: studies use the package, and the package does not use them."""
+"""Mark of the tests of studies as slow: the package does not use the studies."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A study small enough for the tests, to be run as a program as well."""
+"""Study of a few targets for the tests, which can also be run as a program."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STUDY = Study(
 
 
 def main() -> None:
-    """Run it: FOLDER [ADDRESS of a Dask scheduler]."""
+    """Run the study: FOLDER [ADDRESS of a Dask scheduler]."""
     address = sys.argv[2] if len(sys.argv) > 2 else None
     run(STUDY, Path(sys.argv[1]), jobs=2, dask=address, log=ik.logs.Keep())
 

@@ -1,4 +1,4 @@
-"""The benchmark measures another checkout by turns, and every part runs."""
+"""The benchmark alternates with another checkout, and every part of it runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small seeded slice of each study, through its command, to its report."""
+"""Reports on Qiu & Kermani 2021: a small seeded part of each study through its command."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def metrics(folder) -> dict[str, dict]:
 
 
 def test_printed_table():
-    """The abstract: an average success of 96 %, against 12 % by the original methods."""
+    """The abstract states an average success of 96 %, against 12 % by the original methods."""
     assert round(printed_mean("enhanced-dls").success) == 96
     assert 11 < printed_mean("original-dls").success < 12
     assert set(TABLE_I) < set(ik.shipped_grasps("kuka_lwr_barrett"))
@@ -65,7 +65,7 @@ def test_table_one(tmp_path, monkeypatch):
 
 
 def test_every_choice_can_be_built(tmp_path):
-    """Each changed setting makes another solver, and each reading another method."""
+    """Each changed setting gives another solver, and each reading another method."""
     studies = (ablation_study(tmp_path, 1, 0, 1), readings_study(1, 0, 1))
     for study in studies:
         keys = [setting.key for setting in study.settings]
@@ -87,7 +87,7 @@ def test_mounting_face_is_another_palm_frame(robot, tmp_path):
 
 
 def test_one_ablation_changes_the_outcome(tmp_path):
-    """Without the closed chain less is solved: on the same targets."""
+    """Without the closed chain fewer of the same targets are solved."""
     study = ablation_study(tmp_path / "robots", 4, 2021, 4)
     settings_compared = ("enhanced-dls, as in the table", "enhanced-dls, no closed chain")
     budget = {"max_iterations": 400}
@@ -104,7 +104,7 @@ def test_one_ablation_changes_the_outcome(tmp_path):
 
 
 def test_distance_of_a_reading():
-    """Twice the printed rate at half the printed iterations is 2 ln 2 away."""
+    """Twice the printed rate at half the printed iterations has the distance 2 ln 2."""
     study = readings_study(1, 0, 1)
     printed = printed_mean("original-dls")
     count = round(100 / printed.success * 500)  # 1000 solved of so many are twice the rate

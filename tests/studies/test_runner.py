@@ -1,4 +1,4 @@
-"""The study runner: resumable whatever happens, the same whoever solves."""
+"""The study runner resumes after any interruption, with equal results on all workers."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ FOLDERS = os.pathsep.join((str(Path(small_study.__file__).parent), *sys.path))
 
 
 def contents(folder: Path, study=STUDY) -> pl.DataFrame:
-    """All results but the time, in order."""
+    """Return all results without the times, in order."""
     return read_results(study, folder).drop("time").sort("setting", "targets", "target")
 
 
@@ -62,7 +62,7 @@ def test_a_row_per_target_and_setting(done):
 
 
 def test_block_targets_are_independent(done):
-    """Blocks differ, sets differ, and settings share their targets."""
+    """Blocks and sets have different targets, and settings share them."""
     first, second = STUDY.sets
     q = STUDY.configurations(first, 0)
     np.testing.assert_array_equal(q, STUDY.configurations(first, 0))
@@ -79,7 +79,7 @@ def test_jobs_change_nothing(done, tmp_path):
 
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
-    """The address of a scheduler without workers."""
+    """Address of a scheduler without workers."""
     with scheduler_process() as (_, address):
         yield address
 
@@ -92,7 +92,7 @@ def test_a_dask_cluster_without_workers_or_scheduler_is_refused(scheduler, tmp_p
 
 
 def test_a_dask_cluster_needs_the_installed_package_only(done, scheduler, tmp_path):
-    """Scheduler and worker as the documentation starts them; the study as a program."""
+    """Scheduler and worker start like in the documentation; the study is a program."""
     with worker_process(scheduler):
         ended = python(small_study.__file__, tmp_path, scheduler, path=FOLDERS)
         assert ended.returncode == 0, ended.stderr
@@ -121,7 +121,7 @@ def test_a_worker_with_another_version_is_named(monkeypatch):
 
 @POSIX
 def test_random_kills_lose_and_duplicate_nothing(done, tmp_path):
-    """Two workers and their parent are killed again and again until the study is through."""
+    """Two workers and their parent are killed repeatedly until the study is finished."""
     rng = random.Random(3)
     kills = 0
     command = [sys.executable, str(Path(small_study.__file__)), str(tmp_path)]
@@ -133,7 +133,7 @@ def test_random_kills_lose_and_duplicate_nothing(done, tmp_path):
         )
         not_before = time.monotonic() + rng.uniform(0.0, 2.0)
         while kills < 4 and process.poll() is None:
-            # Not before it has begun to work: a process that only imports shows nothing.
+            # Only a process that has started to work is killed.
             file_count = len(list(tmp_path.rglob("*.parquet")))
             if time.monotonic() > not_before and file_count > len(data_before):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -155,7 +155,7 @@ def test_random_kills_lose_and_duplicate_nothing(done, tmp_path):
 
 
 def test_as_many_targets_as_are_asked_for(done, tmp_path):
-    """A block cut short holds the first targets of the whole one, and is filled up later."""
+    """A truncated block has the first targets of the whole one, and is completed later."""
     few = dataclasses.replace(STUDY, count=STUDY.block + 1, settings=STUDY.settings[:1])
     run(few, tmp_path)
     table = contents(tmp_path, few)
@@ -181,7 +181,7 @@ def test_a_changed_seed_is_one_line(done):
 
 
 def test_the_logs_of_a_study_are_one_log(tmp_path):
-    """The blocks of two settings count from 0 and have samples of their own."""
+    """The blocks of two settings are numbered from 0 and have samples of their own."""
     study = dataclasses.replace(STUDY, sets=STUDY.sets[:1], count=8)
     run(study, tmp_path / "study", log=ik.logs.Keep())
     merged = ik.logs.merge_logs(tmp_path / "study", tmp_path / "all.mcap")
@@ -234,7 +234,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
 
 
 def test_wilson_interval():
-    """Against the closed form's well-known example: 8 of 10 gives 49.0 % to 94.3 %."""
+    """The closed form has a known example: 8 of 10 gives 49.0 % to 94.3 %."""
     metric = rate_metric("x", 8, 10)
     assert (metric.value, metric.n, metric.better) == (80.0, 10, "higher")
     assert (round(metric.low, 1), round(metric.high, 1)) == (49.0, 94.3)
