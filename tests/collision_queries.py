@@ -19,11 +19,11 @@ def query_of_contacts(
     solver: ik.Solver,
     points: np.ndarray,
     normals: np.ndarray,
-    held: tuple[str, np.ndarray] | None = None,
+    grasped: tuple[str, np.ndarray] | None = None,
 ) -> Any:
-    """Return the collision query about contacts (k, f, 3); `held`: object and poses (k, 4, 4)."""
+    """Return the collision query about contacts (k, f, 3), with an object at poses (k, 4, 4)."""
     targets = solver._target_builder.from_arrays(points, normals)
-    return _query(solver, targets if held is None else targets.holding(*held))
+    return _query(solver, targets if grasped is None else targets.holding(*grasped))
 
 
 def query_at(solver: ik.Solver, q: np.ndarray) -> Any:

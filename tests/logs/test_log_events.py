@@ -300,7 +300,7 @@ def test_solves_have_independent_events(seed: int, counts: list[int]) -> None:
 
 
 def test_collision_entries_and_exits() -> None:
-    """One solve starts in collision and is free twice; another is always free."""
+    """Entries and exits of two solves: one starts in collision, the other is always free."""
     form = TraceFormat(Layout.record(Field("clearance", (), "f4", "m")))
     rows = np.zeros(9, form.layout.dtype)
     rows["clearance"] = [-0.01, 0.001, 0.003, 0.001, 0.004, 0.002, 0.005, np.nan, 0.002]
