@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from casadi_ik.files.arrays import Array
+from casadi_ik.integrations.importing.limbs import is_wheel
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint, joint_positions, joints_below, link_poses, moving_below
 from casadi_ik.model.xml_tree import RobotTree, TreeJoint
@@ -58,18 +59,10 @@ def locked_unused_joints(tree: RobotTree, used_joints: Sequence[TreeJoint]) -> d
 def locked_spinners(tree: RobotTree, palm: str) -> dict[str, float]:
     """Return the position zero for continuous joints below a palm, such as propellers.
 
-    Only joints that move no other joint are fixed, and only if another chain may be a finger.
+    The joints are fixed only if another chain may be a finger.
     """
     first_joints = moving_below(tree, palm)
-    leaders = {joint.coupling.of for joint in tree.joints if joint.coupling is not None}
-    spinners = [
-        joint
-        for joint in first_joints
-        if joint.type == "continuous"
-        and not joint.coupling
-        and not moving_below(tree, joint.child)
-        and joint.name not in leaders
-    ]
+    spinners = [joint for joint in first_joints if is_wheel(tree, joint)]
     return {joint.name: 0.0 for joint in spinners} if len(spinners) < len(first_joints) else {}
 
 

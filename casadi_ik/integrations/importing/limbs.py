@@ -107,7 +107,7 @@ def _ends_below(tree: RobotTree, link: str, parent_joint: TreeJoint | None) -> l
         parent_joint: Joint that moves the link; None for the root.
     """
     chains = moving_below(tree, link)
-    chains = [joint for joint in chains if not _is_wheel(tree, joint)] or chains
+    chains = [joint for joint in chains if not is_wheel(tree, joint)] or chains
     if not chains:
         if parent_joint is not None and (
             re.search(f"{JAW_PATTERN}|gripper", parent_joint.name.lower())
@@ -132,7 +132,7 @@ def _carries_a_palm(tree: RobotTree, joint: TreeJoint) -> bool:
     return any(len(moving_below(tree, link)) >= MIN_PALM_CHAINS for link in links)
 
 
-def _is_wheel(tree: RobotTree, joint: TreeJoint) -> bool:
+def is_wheel(tree: RobotTree, joint: TreeJoint) -> bool:
     """Return whether a joint is continuous, is not coupled, and moves no other joint."""
     leads = any(
         candidate.coupling and candidate.coupling.of == joint.name for candidate in tree.joints

@@ -40,167 +40,6 @@ from casadi_ik.planning.touch.strength import (
 from casadi_ik.planning.touch.surface import Surface, SurfaceSource, load_surface
 from casadi_ik.solve.solution import BatchSolution
 
-CLOSURE_FRICTION = float(np.cos(np.pi / 8))
-"""Factor of the friction coefficient in tests of force closure.
-
-Friction cones reduced by this factor lie within every pyramid of eight or more edges that is
-inscribed in the full cones, so that tests with any such pyramid agree.
-"""
-
-
-def at_configurations(
-    generator: Generator, hands: HandCandidates, q: Array, pose: Array
-) -> HandCandidates:
-    """Return the hands at solved configurations, with their contacts.
-
-    Args:
-        generator: Generator of the candidates.
-        hands: Hands before the arm was solved; only `touches` is used.
-        q: (k, n) solved configurations.
-        pose: (4, 4) pose of the object in the base frame.
-    """
-    table = generator.table
-    palm = inverse(pose) @ table.robot.palm(q)
-    solved = replace(hands, palm=palm, hand=np.take(q, table.motors, axis=1), contacts=None)
-    return replace(
-        solved,
-        tips=fingertip_pads(table, solved).points,
-        contacts=tip_contacts(table, generator.surface, solved),
-    )
-
-
-def confirmed_rows(generator: Generator, hands: HandCandidates, mu: float) -> NDArray[np.intp]:
-    """Return the rows of hands whose contacts meet the limits and are force-closed."""
-    assert hands.contacts is not None
-    is_accepted = hands.contacts.accepted(generator.parameters, generator.table.roll)
-    rows = np.flatnonzero((is_accepted | ~hands.touches).all(axis=1))
-    load = closure_load(contact_wrenches(generator, hands.rows(rows), CLOSURE_FRICTION * mu))
-    return rows[load > MIN_CLOSURE_LOAD]
-
-
-def values_of_contacts(hands: HandCandidates, values: Array) -> Array:
-    """Return the values (k, c, ...) at contacts, from values (k, f, ...) by finger."""
-    return values[hands.touches].reshape(len(hands), -1, *values.shape[2:])
-
-
-def contact_wrenches(generator: Generator, hands: HandCandidates, mu: float) -> Array:
-    """Return the wrenches (k, 6, g) of the edges of the friction cones of hands."""
-    assert hands.contacts is not None
-    surface, contacts = generator.surface, hands.contacts
-    foot, inward, normal_spread = (
-        values_of_contacts(hands, values)
-        for values in (contacts.foot, contacts.inward, contacts.normal_spread)
-    )
-    return friction_wrenches(
-        foot, inward, narrowed_friction(mu, normal_spread), surface.middle, surface.size / 2
-    )
-
-
-def hand_strengths(
-    generator: Generator, hands: HandCandidates, mu: float, hold: tuple[float, float] | None
-) -> GraspStrengths:
-    """Return the strength of the grasps of hands."""
-    assert hands.contacts is not None
-    table, surface, robot = generator.table, generator.surface, generator.table.robot
-    _, _, linear, angular = table.pads(hands.hand)
-    foot, inward, direction = (
-        values_of_contacts(hands, values)
-        for values in (hands.contacts.foot, hands.contacts.inward, hands.contacts.direction)
-    )
-    radii = table.radii[np.nonzero(hands.touches)[1]].reshape(len(hands), -1)
-    rotation = hands.palm[:, None, :3, :3]
-    angular, linear = (rotation @ values_of_contacts(hands, values) for values in (angular, linear))
-    # The contact of a ball pad is a radius away from its centre.
-    jacobians = linear + np.cross(angular, (radii[..., None] * direction)[..., None], axis=2)
-    return grasp_strengths(
-        contact_wrenches(generator, hands, mu),
-        foot - surface.middle,
-        inward,
-        radii,
-        jacobians,
-        [robot.description.actuators[i] for i in table.motors],
-        mu,
-        hold,
-    )
-
-
-OPENINGS = (0.025, 0.015, 0.008)
-"""Openings of the pregrasp: distances of the fingertips from the object [m].
-
-The first collision-free one is used.
-"""
-
-SQUEEZE_DEPTH = 5e-3
-"""Mean penetration of the fingertips at the posture `Grasp.squeeze` [m]."""
-
-RETREAT = 0.06
-"""Distance between the palms of grasp and pregrasp [m]."""
-
-
-def grasp_records(
-    generator: Generator, hands: HandCandidates, q: Array, pose: Array, forces: Array
-) -> list[Grasp]:
-    """Return the grasps of solved hands, with the open hand before and the squeezing hand after.
-
-    Args:
-        generator: Generator of the candidates.
-        hands: Hands at the configurations, with their contacts.
-        q: (k, n) configurations.
-        pose: (4, 4) pose of the object in the base frame.
-        forces: (k, f, 3) forces on the object, base frame.
-    """
-    table, robot = generator.table, generator.table.robot
-    assert hands.contacts is not None
-    is_ball = table.radii > 0
-    points, normals = robot.contacts(q)
-    centers = points - table.radii[:, None] * normals
-    directions = np.nan_to_num(hands.contacts.direction) @ pose[:3, :3].T
-    contact_points = np.where(is_ball[:, None], centers + table.radii[:, None] * directions, points)
-    palms = robot.palm(q)
-    palm_forces, palm_offsets = (
-        np.einsum("kfi,kij->kfj", vectors, palms[:, :3, :3])
-        for vectors in (forces, contact_points - centers)
-    )
-    squeezed = table.squeezed(hands, palm_offsets, palm_forces, SQUEEZE_DEPTH)
-    opened, is_open = hands.hand.copy(), np.zeros(len(hands), dtype=bool)
-    for opening in OPENINGS:
-        rows = np.flatnonzero(~is_open)
-        if len(rows):
-            trial = table.opened(hands.rows(rows), opening)
-            is_free = generator.hand_check(trial)
-            opened[rows[is_free]], is_open[rows[is_free]] = trial.hand[is_free], True
-    motors = [robot.actuators[i] for i in table.motors]
-    stem = Path(generator.surface.object.name).stem
-    grasps = []
-    for i in range(len(hands)):
-        contacts = {}
-        for j in np.flatnonzero(hands.touches[i]):
-            ball = directions[i, j] if is_ball[j] else None
-            contacts[robot.fingers[j]] = Contact(contact_points[i, j], normals[i, j], ball=ball)
-        retreated = palms[i].copy()
-        center = np.mean([contact.point for contact in contacts.values()], axis=0)
-        offset = retreated[:3, 3] - center
-        retreated[:3, 3] += RETREAT * offset / max(float(np.linalg.norm(offset)), 1e-9)
-        posture, open_posture, squeezing_posture = (
-            dict(zip(motors, positions[i].tolist(), strict=True))
-            for positions in (hands.hand, opened, squeezed)
-        )
-        pregrasp = Grasp(robot=robot.name, palm=retreated, posture=open_posture)
-        grasps.append(
-            Grasp(
-                contacts,
-                robot=robot.name,
-                name=f"{stem} {'+'.join(contacts)}",
-                object=generator.surface.name,
-                object_pose=pose,
-                posture=posture,
-                pregrasp=pregrasp if is_open[i] else None,
-                squeeze=Grasp(robot=robot.name, palm=palms[i], posture=squeezing_posture),
-            )
-        )
-    return grasps
-
-
 Ranking = str | Callable[[ArmHand, Array], ArrayLike]
 """Ranking of grasps: a name of `RANKINGS`, or a function of robot and q (m, n) to scores (m,)."""
 
@@ -558,3 +397,164 @@ def _ranked(
         values = float(load[row]), float(closure[row]), float(score[row])
         ranked.append(FoundGrasp(grasp, solution, *values, by_finger, float(most_squeeze[row])))
     return FoundGrasps(tuple(ranked), generator.counts, name, 0.0, "", *context)
+
+
+CLOSURE_FRICTION = float(np.cos(np.pi / 8))
+"""Factor of the friction coefficient in tests of force closure.
+
+Friction cones reduced by this factor lie within every pyramid of eight or more edges that is
+inscribed in the full cones, so that tests with any such pyramid agree.
+"""
+
+
+def at_configurations(
+    generator: Generator, hands: HandCandidates, q: Array, pose: Array
+) -> HandCandidates:
+    """Return the hands at solved configurations, with their contacts.
+
+    Args:
+        generator: Generator of the candidates.
+        hands: Hands before the arm was solved; only `touches` is used.
+        q: (k, n) solved configurations.
+        pose: (4, 4) pose of the object in the base frame.
+    """
+    table = generator.table
+    palm = inverse(pose) @ table.robot.palm(q)
+    solved = replace(hands, palm=palm, hand=np.take(q, table.motors, axis=1), contacts=None)
+    return replace(
+        solved,
+        tips=fingertip_pads(table, solved).points,
+        contacts=tip_contacts(table, generator.surface, solved),
+    )
+
+
+def confirmed_rows(generator: Generator, hands: HandCandidates, mu: float) -> NDArray[np.intp]:
+    """Return the rows of hands whose contacts meet the limits and are force-closed."""
+    assert hands.contacts is not None
+    is_accepted = hands.contacts.accepted(generator.parameters, generator.table.roll)
+    rows = np.flatnonzero((is_accepted | ~hands.touches).all(axis=1))
+    load = closure_load(contact_wrenches(generator, hands.rows(rows), CLOSURE_FRICTION * mu))
+    return rows[load > MIN_CLOSURE_LOAD]
+
+
+def values_of_contacts(hands: HandCandidates, values: Array) -> Array:
+    """Return the values (k, c, ...) at contacts, from values (k, f, ...) by finger."""
+    return values[hands.touches].reshape(len(hands), -1, *values.shape[2:])
+
+
+def contact_wrenches(generator: Generator, hands: HandCandidates, mu: float) -> Array:
+    """Return the wrenches (k, 6, g) of the edges of the friction cones of hands."""
+    assert hands.contacts is not None
+    surface, contacts = generator.surface, hands.contacts
+    foot, inward, normal_spread = (
+        values_of_contacts(hands, values)
+        for values in (contacts.foot, contacts.inward, contacts.normal_spread)
+    )
+    return friction_wrenches(
+        foot, inward, narrowed_friction(mu, normal_spread), surface.middle, surface.size / 2
+    )
+
+
+def hand_strengths(
+    generator: Generator, hands: HandCandidates, mu: float, hold: tuple[float, float] | None
+) -> GraspStrengths:
+    """Return the strength of the grasps of hands."""
+    assert hands.contacts is not None
+    table, surface, robot = generator.table, generator.surface, generator.table.robot
+    _, _, linear, angular = table.pads(hands.hand)
+    foot, inward, direction = (
+        values_of_contacts(hands, values)
+        for values in (hands.contacts.foot, hands.contacts.inward, hands.contacts.direction)
+    )
+    radii = table.radii[np.nonzero(hands.touches)[1]].reshape(len(hands), -1)
+    rotation = hands.palm[:, None, :3, :3]
+    angular, linear = (rotation @ values_of_contacts(hands, values) for values in (angular, linear))
+    # The contact of a ball pad is a radius away from its centre.
+    jacobians = linear + np.cross(angular, (radii[..., None] * direction)[..., None], axis=2)
+    return grasp_strengths(
+        contact_wrenches(generator, hands, mu),
+        foot - surface.middle,
+        inward,
+        radii,
+        jacobians,
+        [robot.description.actuators[i] for i in table.motors],
+        mu,
+        hold,
+    )
+
+
+OPENINGS = (0.025, 0.015, 0.008)
+"""Openings of the pregrasp: distances of the fingertips from the object [m].
+
+The first collision-free one is used.
+"""
+
+SQUEEZE_DEPTH = 5e-3
+"""Mean penetration of the fingertips at the posture `Grasp.squeeze` [m]."""
+
+RETREAT = 0.06
+"""Distance between the palms of grasp and pregrasp [m]."""
+
+
+def grasp_records(
+    generator: Generator, hands: HandCandidates, q: Array, pose: Array, forces: Array
+) -> list[Grasp]:
+    """Return the grasps of solved hands, with the open hand before and the squeezing hand after.
+
+    Args:
+        generator: Generator of the candidates.
+        hands: Hands at the configurations, with their contacts.
+        q: (k, n) configurations.
+        pose: (4, 4) pose of the object in the base frame.
+        forces: (k, f, 3) forces on the object, base frame.
+    """
+    table, robot = generator.table, generator.table.robot
+    assert hands.contacts is not None
+    is_ball = table.radii > 0
+    points, normals = robot.contacts(q)
+    centers = points - table.radii[:, None] * normals
+    directions = np.nan_to_num(hands.contacts.direction) @ pose[:3, :3].T
+    contact_points = np.where(is_ball[:, None], centers + table.radii[:, None] * directions, points)
+    palms = robot.palm(q)
+    palm_forces, palm_offsets = (
+        np.einsum("kfi,kij->kfj", vectors, palms[:, :3, :3])
+        for vectors in (forces, contact_points - centers)
+    )
+    squeezed = table.squeezed(hands, palm_offsets, palm_forces, SQUEEZE_DEPTH)
+    opened, is_open = hands.hand.copy(), np.zeros(len(hands), dtype=bool)
+    for opening in OPENINGS:
+        rows = np.flatnonzero(~is_open)
+        if len(rows):
+            trial = table.opened(hands.rows(rows), opening)
+            is_free = generator.hand_check(trial)
+            opened[rows[is_free]], is_open[rows[is_free]] = trial.hand[is_free], True
+    motors = [robot.actuators[i] for i in table.motors]
+    stem = Path(generator.surface.object.name).stem
+    grasps = []
+    for i in range(len(hands)):
+        contacts = {}
+        for j in np.flatnonzero(hands.touches[i]):
+            ball = directions[i, j] if is_ball[j] else None
+            contacts[robot.fingers[j]] = Contact(contact_points[i, j], normals[i, j], ball=ball)
+        retreated = palms[i].copy()
+        center = np.mean([contact.point for contact in contacts.values()], axis=0)
+        offset = retreated[:3, 3] - center
+        retreated[:3, 3] += RETREAT * offset / max(float(np.linalg.norm(offset)), 1e-9)
+        posture, open_posture, squeezing_posture = (
+            dict(zip(motors, positions[i].tolist(), strict=True))
+            for positions in (hands.hand, opened, squeezed)
+        )
+        pregrasp = Grasp(robot=robot.name, palm=retreated, posture=open_posture)
+        grasps.append(
+            Grasp(
+                contacts,
+                robot=robot.name,
+                name=f"{stem} {'+'.join(contacts)}",
+                object=generator.surface.name,
+                object_pose=pose,
+                posture=posture,
+                pregrasp=pregrasp if is_open[i] else None,
+                squeeze=Grasp(robot=robot.name, palm=palms[i], posture=squeezing_posture),
+            )
+        )
+    return grasps
