@@ -271,12 +271,19 @@ def encode_gif(images: Sequence[Image], milliseconds: Sequence[int], colors: int
     shared_palette = sheet.quantize(colors)
     # The background keeps its exact colour; otherwise the edge of the picture is visible.
     entries = np.reshape(shared_palette.getpalette() or [], (-1, 3))
-    paper = np.array(frames[0].getpixel((width - 1, 0)))
-    entries[np.abs(entries - paper).sum(axis=1).argmin()] = paper
+    colors_and_counts = np.unique(np.asarray(frames[0]).reshape(-1, 3), axis=0, return_counts=True)
+    paper = colors_and_counts[0][colors_and_counts[1].argmax()].astype(int)
+    paper_index = int(np.abs(entries - paper).sum(axis=1).argmin())
+    entries[paper_index] = paper
     shared_palette.putpalette(entries.ravel().tolist())
-    quantised = [
-        sample.quantize(palette=shared_palette, dither=Pillow.Dither.NONE) for sample in frames
-    ]
+    quantised = []
+    for frame in frames:
+        # Pillow assigns some other entry to a colour that is close to several.
+        indices = np.array(frame.quantize(palette=shared_palette, dither=Pillow.Dither.NONE))
+        indices[(np.asarray(frame) == paper).all(axis=2)] = paper_index
+        image = Pillow.fromarray(indices)
+        image.putpalette(entries.ravel().tolist())
+        quantised.append(image)
     buffer = io.BytesIO()
     quantised[0].save(
         buffer,
