@@ -8,6 +8,7 @@ from commands import main
 
 import casadi_ik as ik
 from casadi_ik.planning.reach.check import JointChain, pose_frames
+from casadi_ik.planning.reach.decide import PalmReach, exact_family
 from casadi_ik.planning.reach.reach_map import ReachMap
 
 BOX = ([-0.9, -0.9, -0.2], [0.9, 0.9, 1.0])
@@ -68,6 +69,31 @@ def test_a_check_never_excludes_the_configuration_of_a_palm_pose():
             assert (low <= q).all()
             assert (q <= high).all()
             assert len(low) == 1
+
+
+def test_few_palm_poses_are_open_within_tolerance(solver, reach):
+    palms = np.concatenate([reach.palms(i) for i in range(0, len(reach.positions), 7)])
+    tolerant = solver.reach_map(palms, meaning="within tolerance", keep_q=False)
+    assert tolerant.counts["OPEN"] < 0.2 * len(palms)
+    exact = reach.status[::7].ravel()
+    assert not np.any((tolerant.status[:, 0] == "UNREACHABLE") & (exact == "REACHABLE"))
+
+
+def test_no_pose_within_tolerance_of_a_reachable_one_is_refuted(solver):
+    rng = np.random.default_rng(0)
+    palms = solver.robot.palm(solver.robot.random(rng, 30))
+    palms[:, :3, 3] += rng.uniform(-0.0028, 0.0028, (30, 3))
+    angles = rng.uniform(-0.052, 0.052, 30)
+    for palm, angle in zip(palms, angles, strict=True):
+        palm[:3, :3] = palm[:3, :3] @ axis_turn(angle)
+    family = exact_family(solver.robot)
+    arm = PalmReach(solver.robot, family)
+    assert not arm.refute_within(palms, ik.Tolerance(0.005, np.radians(3))).any()
+
+
+def axis_turn(angle):
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]])
 
 
 def test_threads_give_the_same_map(solver, reach):

@@ -16,11 +16,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from casadi_ik.files.arrays import Array, Rows, spread_points
+from casadi_ik.files.arrays import Array, Bools, Rows, spread_points
+from casadi_ik.files.input_checks.poses import rotations_from_quaternions
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import ClosedForm
 from casadi_ik.kinematics.arms.recognise import arm_family
@@ -68,6 +70,8 @@ class ReachParameters:
         depth: Number of divisions.
         tolerance_depth: Number of divisions for palm poses with a tolerance, whose boundary is
             wider than the intervals of a deep division.
+        rotation_parts: Number of parts of each coordinate of the rotations within a tolerance, for
+            arms without and with redundancy, whose parts take more time.
         max_boxes: Maximum number of intervals of all palm poses of a chunk.
         chunk_size: Number of palm poses that are decided together.
         limit_tolerance: Smallest distance of a witness from its limits [rad]: rounding.
@@ -78,6 +82,7 @@ class ReachParameters:
     parts: int = 8
     depth: int = 6
     tolerance_depth: int = 3
+    rotation_parts: tuple[int, int] = (8, 4)
     max_boxes: int = 4_000_000
     chunk_size: int = 32_768
     limit_tolerance: float = -1e-9
@@ -154,6 +159,46 @@ class PalmReach:
             chunk.run()
             code[rows], q[rows] = chunk.code, chunk.q
         return PalmDecision(code, q)
+
+    def refute_within(self, palms: Array, tolerance: Tolerance) -> Bools:
+        """Return (k,) True for palm poses (k, 4, 4) without reachable poses within a tolerance.
+
+        The poses within the tolerance are divided into smaller sets, which are refuted separately:
+        the intervals of a set overestimate its rotations less.
+        """
+        is_refuted = np.zeros(len(palms), dtype=bool)
+        has_redundancy = self.redundancy_range[0] < self.redundancy_range[1]
+        parts, part_tolerance = _tolerance_parts(
+            tolerance, REACH_PARAMETERS.rotation_parts[int(has_redundancy)]
+        )
+        step = max(REACH_PARAMETERS.chunk_size // len(parts), 1)
+        for start in range(0, len(palms), step):
+            rows = slice(start, start + step)
+            poses = np.repeat(palms[rows, None], len(parts), axis=1)
+            poses[:, :, :3, :3] = poses[:, :, :3, :3] @ parts[:, :3, :3]
+            poses[:, :, :3, 3] += parts[:, :3, 3]
+            code = self.decide(poses.reshape(-1, 4, 4), part_tolerance).code
+            is_part_refuted = code.reshape(-1, len(parts)) == Reachability.UNREACHABLE
+            is_refuted[rows] = is_part_refuted.all(axis=1)
+        return is_refuted
+
+
+def _tolerance_parts(tolerance: Tolerance, count: int) -> tuple[Array, Tolerance]:
+    """Return relative poses (m, 4, 4) and the tolerance of sets that cover those of a tolerance.
+
+    The rotation vectors are divided into cubes, `count` along each axis. The angle between two
+    rotations is at most the distance of their rotation vectors.
+    """
+    width = tolerance.angle / count
+    edges = width * (2 * np.arange(count) + 1 - count)
+    vectors = np.array(list(product(edges, repeat=3)))
+    angles = np.linalg.norm(vectors, axis=1, keepdims=True)
+    quaternions = np.hstack([np.cos(angles / 2), vectors * np.sinc(angles / (2 * np.pi)) / 2])
+    shifts = np.array(list(product((-0.5, 0.5), repeat=3))) * tolerance.position
+    parts = np.tile(np.eye(4), (len(vectors) * len(shifts), 1, 1))
+    parts[:, :3, :3] = np.repeat(rotations_from_quaternions(quaternions), len(shifts), axis=0)
+    parts[:, :3, 3] = np.tile(shifts, (len(vectors), 1))
+    return parts, Tolerance(tolerance.position / 2, width * np.sqrt(3))
 
 
 def arm_limits(robot: ArmHand, enforce_limits: bool) -> tuple[Array, Array]:

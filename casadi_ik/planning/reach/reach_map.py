@@ -365,6 +365,10 @@ def reach_map(
             solved, arms = _solve(solver, palms[undecided])
             code[cells][undecided[solved]] = Reachability.REACHABLE
             witnesses[undecided[solved]] = arms
+            if arm is not None and tolerance is not None:
+                remaining = undecided[~solved]
+                refuted = remaining[arm.refute_within(palms[remaining], tolerance)]
+                code[cells][refuted] = Reachability.UNREACHABLE
         if q is not None:
             q[cells] = witnesses
 
