@@ -55,7 +55,7 @@ class BestEffort:
                 raise InputError(f"weights: {finger!r} has {pair!r}; {expected}")
 
     @classmethod
-    def of(cls, value: object) -> BestEffort | None:
+    def from_argument(cls, value: object) -> BestEffort | None:
         """Return the options of a value of `best_effort`; None for False.
 
         Raises:

@@ -51,7 +51,7 @@ class SolveOptions:
         recorder: Recorder of the iterations; None: they are not recorded.
         diagnose: Whether to diagnose targets that are not solved.
         best_effort: Whether to return the nearest configuration of targets that are not solved, or
-            its options, see `BestEffort.of`.
+            its options, see `BestEffort.from_argument`.
         show_progress: Whether to show a progress bar on an interactive terminal.
     """
 
@@ -63,7 +63,7 @@ class SolveOptions:
 
     def __post_init__(self) -> None:
         if self.best_effort is not False:
-            BestEffort.of(self.best_effort)
+            BestEffort.from_argument(self.best_effort)
         if not isinstance(self.jobs, (int, np.integer)) or self.jobs < 1:
             raise InputError(f"jobs: found {self.jobs!r}, expected an integer >= 1")
         self.jobs = int(self.jobs)
@@ -434,7 +434,7 @@ class Engine:
                         part,
                         batch,
                     )
-            if (best_effort := BestEffort.of(options.best_effort)) is not None:
+            if (best_effort := BestEffort.from_argument(options.best_effort)) is not None:
                 batch = self._replace_by_nearest(search_targets, outcome, batch, query, best_effort)
             q = in_nearest_turns(self.robot.description, part, batch.q)
             batch = replace(batch, q=q)

@@ -45,7 +45,7 @@ class NearestSettings:
         seeds: Settings of the seeds.
         race_steps: Number of steps that all starts make.
         finalists: Number of starts that continue to the minimum, and additional ones per motor.
-        same: Relative difference of two distances below which one of two starts continues.
+        duplicate_gap: Relative difference of two distances below which one of two starts continues.
         tie: Relative difference of two minima below which the configuration nearer to the start
             is chosen.
         chunk_size: Number of targets whose starts are in memory at the same time.
@@ -54,7 +54,7 @@ class NearestSettings:
     seeds: SeedSettings = SEED_SETTINGS
     race_steps: int = 12
     finalists: tuple[int, int] = (12, 1)
-    same: float = 1e-3
+    duplicate_gap: float = 1e-3
     tie: float = 1e-6
     chunk_size: int = 32
 
@@ -182,7 +182,7 @@ class SearchMemory:
             length=LENGTH,
             damping=DESCENT.damping,
             tie=settings.tie,
-            same=settings.same,
+            duplicate_gap=settings.duplicate_gap,
         )
 
     def descents(self, count: int) -> tuple[Rows, Array]:

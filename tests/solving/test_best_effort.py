@@ -239,8 +239,8 @@ def test_weights_replace_tolerances(robot):
         points, normals, best_effort=ik.BestEffort(weights=dict.fromkeys(scaled, (1.0, 0.0)))
     )
     position = np.linalg.norm(robot.contacts(by_position.q)[0] - points, axis=2)
-    others = np.linalg.norm(robot.contacts(weighted.q)[0] - points, axis=2)
-    assert ((position**2).sum(axis=1) <= (others**2).sum(axis=1) * (1 + 1e-6))[rows].all()
+    distance = np.linalg.norm(robot.contacts(weighted.q)[0] - points, axis=2)
+    assert ((position**2).sum(axis=1) <= (distance**2).sum(axis=1) * (1 + 1e-6))[rows].all()
 
 
 def test_minimax_lowers_the_largest_error(robot):

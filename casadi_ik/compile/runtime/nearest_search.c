@@ -289,10 +289,10 @@ static void select_finalists(nearest_search_job *job, int64_t target) {
   int64_t *finalists = job->finalists + target * job->n_finalists, length = 0, count = 1, i;
   for (i = 0; i < job->n_starts; ++i) length = insert_descent(job, target * job->n_starts + i, length);
   finalists[0] = job->sorted[0];
-  i = nearest_tied(job, job->sorted, length, job->same);
+  i = nearest_tied(job, job->sorted, length, job->duplicate_gap);
   if (i != finalists[0] && count < job->n_finalists) finalists[count++] = i;
   for (i = 1; i < length && count < job->n_finalists; ++i) {
-    if (job->sorted_values[i] > job->sorted_values[i - 1] * (1 + job->same)) {
+    if (job->sorted_values[i] > job->sorted_values[i - 1] * (1 + job->duplicate_gap)) {
       finalists[count++] = job->sorted[i];
     }
   }

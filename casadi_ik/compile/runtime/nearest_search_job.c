@@ -41,5 +41,5 @@ typedef struct {
   int64_t count;               /* number of targets */
   int64_t n_starts, n_candidates, n_finalists, race_steps, max_iterations;
   int64_t stage, last_stage;   /* current stage; the call ends after the last one */
-  scalar length, damping, tie, same;
+  scalar length, damping, tie, duplicate_gap;
 } nearest_search_job;
