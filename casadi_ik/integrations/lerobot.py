@@ -19,6 +19,7 @@ from casadi_ik.errors import InputError, InvalidPoseError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
 from casadi_ik.files.input_checks.poses import single_pose
+from casadi_ik.kinematics.arm_hand import load_robot
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.solve.status import Status
 
@@ -144,18 +145,27 @@ class ContactsToJoints(RobotActionProcessorStep):
     nearest configuration of their branch.
 
     Attributes:
-        solver: Solver of the robot.
+        solver: Solver of the robot, or the name of the robot, from which a solver is made.
         q: (n,) Last targets; None: home.
         status: Status of the last contacts; INVALID if the tracker had lost the hand.
     """
 
-    solver: Solver
+    solver: Solver | str
     q: Array | None = None
     status: Status = field(default=Status.SOLVED, init=False)
 
+    def __post_init__(self) -> None:
+        """Make the solver of a robot that is specified by name."""
+        name = self.solver
+        self._solver = Solver(load_robot(name)) if isinstance(name, str) else name
+
+    def get_config(self) -> dict[str, Any]:
+        """Return the arguments of the step, with which LeRobot stores a pipeline."""
+        return {"solver": self._solver.robot.description.name}
+
     def action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Replace the contacts of an action by motor targets."""
-        robot = self.solver.robot
+        robot = self._solver.robot
         q0 = robot.home if self.q is None else self.q
         points, normals = (
             {name: [action.pop(f"{name}.{key}", np.nan) for key in keys] for name in robot.fingers}
@@ -165,7 +175,7 @@ class ContactsToJoints(RobotActionProcessorStep):
         if grasp is None:
             self.status, self.q = Status.INVALID, q0
         else:
-            solution = self.solver.solve(
+            solution = self._solver.solve(
                 grasp, q0=q0, prefer="q0", diagnose=False, best_effort="local"
             )
             self.status = solution.status
@@ -176,7 +186,7 @@ class ContactsToJoints(RobotActionProcessorStep):
 
     def transform_features(self, features: dict[Any, dict[str, Any]]) -> dict[Any, dict[str, Any]]:
         """Replace the features of contacts by features of motors."""
-        action_features, robot = features[PipelineFeatureType.ACTION], self.solver.robot
+        action_features, robot = features[PipelineFeatureType.ACTION], self._solver.robot
         for name in (f"{x}.{key}" for x in robot.fingers for key in (*POINT_KEYS, *NORMAL_KEYS)):
             action_features.pop(name, None)
         for name in robot.actuators:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -149,3 +152,30 @@ def test_action_contacts_become_motor_targets(rng):
     assert set(features[PipelineFeatureType.ACTION]) == set(done) - {"speed"}
     step.reset()
     assert step.q is None
+
+
+def test_plugin_is_discovered_and_its_step_is_stored_by_name(monkeypatch, tmp_path):
+    from lerobot.processor import ProcessorStepRegistry
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    plugin = Path(__file__).parents[2] / "plugins/lerobot_robot_casadi_ik"
+    name = plugin.name
+    metadata = tmp_path / f"{name}-0.1.0.dist-info" / "METADATA"
+    metadata.parent.mkdir()
+    metadata.write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1.0\n")
+    monkeypatch.syspath_prepend(str(plugin))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    register_third_party_plugins()
+    assert name in sys.modules
+    assert ProcessorStepRegistry.get("casadi_ik_contacts_to_joints") is ContactsToJoints
+    pipeline(ContactsToJoints("panda+allegro_right")).save_pretrained(tmp_path / "steps")
+    (config,) = (tmp_path / "steps").glob("*.json")
+    loaded = RobotProcessorPipeline.from_pretrained(
+        tmp_path / "steps",
+        config.name,
+        to_transition=robot_action_observation_to_transition,
+        to_output=transition_to_robot_action,
+    )
+    robot = ik.load_robot("panda+allegro_right")
+    assert set(loaded(({}, {}))) == {f"{motor}.pos" for motor in robot.actuators}
