@@ -210,7 +210,11 @@ class Control:
         """
         self._pose: Array | None = None
         self.handle = server.scene.add_transform_controls(
-            name, scale=size, line_width=3.0, depth_test=False
+            name,
+            scale=size,
+            line_width=2.5,
+            depth_test=False,
+            disable_sliders=True,  # the squares between the arrows would cover small objects
         )
         self.select(False)
         self.meshes = {
@@ -244,7 +248,7 @@ class Control:
     def select(self, is_selected: bool) -> None:
         """Show or hide arrows and rings."""
         handle = self.handle
-        handle.disable_axes = handle.disable_sliders = handle.disable_rotations = not is_selected
+        handle.disable_axes = handle.disable_rotations = not is_selected
 
 
 class Handles:
