@@ -61,7 +61,8 @@ def backend(
         The client of the cluster; None: this machine.
 
     Raises:
-        InputError: The scheduler does not answer, has no worker, or a worker lacks a package.
+        InputError: The scheduler does not answer or has no worker, or a package is missing or has
+            another version on the scheduler or on a worker.
         UnsupportedError: joblib or Dask is not installed on this machine.
     """
     check_installed(dask)
@@ -225,7 +226,8 @@ def _solver(pickled: bytes) -> Solver:
 class BatchFolder:
     """Folder with the parts of one batch.
 
-    A part is stored completely or not at all; a kill loses only the parts that are being solved.
+    A part is stored completely or not at all; a batch that is killed loses only the parts that
+    were being solved.
 
     Attributes:
         path: Path of the folder.
@@ -252,7 +254,8 @@ class BatchFolder:
             resume: Accept parts that are stored already.
 
         Raises:
-            InputError: The folder holds something else, or parts although `resume` is false.
+            InputError: The folder holds another batch or other files, or it holds this batch and
+                `resume` is false.
             OSError: The folder cannot be written.
         """
         manifest = json.loads(json.dumps({"format": 1, **batch}))
@@ -388,8 +391,8 @@ def solve_parts(
     ):
         import joblib
 
-        # A batch of several calls would return, or be lost, as a whole. joblib annotates this
-        # argument as the literal "auto".
+        # A batch of several calls would return, or be lost, as a whole. The type is Any because
+        # joblib annotates this argument as the literal "auto".
         batch_size: Any = 1
         parallel = joblib.Parallel(return_as="generator_unordered", batch_size=batch_size)
         parts = source.remaining_parts(done)

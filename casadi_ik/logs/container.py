@@ -64,8 +64,8 @@ _LIBRARY_ERRORS = (McapError, struct.error, ValueError, MemoryError, OverflowErr
 """Exceptions of the library for damaged bytes."""
 
 SECTION_SIZE = 2**24
-"""Maximum size of a section of messages without chunks, unless a single message is larger [bytes].
-A log in sections is then read with about as much memory as a log in chunks."""
+"""Maximum size of a section, which is a run of messages outside of chunks [bytes]; a single larger
+message is a section of its own. Reading sections thus takes about as much memory as chunks."""
 
 
 class ForeignLogError(LogError):
@@ -83,14 +83,15 @@ class Contents:
     Attributes:
         path: Path of the file.
         size: Its size [bytes].
-        summary: Schemas, channels, indexes and counts, as the library has them. Its chunk indexes
-            include those of sections (`section_index`).
+        summary: Schemas, channels, indexes and counts, in the `Summary` class of the library.
+            Its chunk indexes include those of sections (`section_index`).
         records: Metadata records.
         complete: False if the file has no end: its writer was killed, the disk was full, or it is
             still being written. `summary` then covers every complete chunk.
         end: Offset of the end of the last complete record.
         unindexed_runs: Messages of the last chunk if its message indexes are incomplete.
-        message_index_offsets: Offsets of the message indexes that exist for these, by channel.
+        message_index_offsets: Offsets of the message indexes read so far for these messages, by
+            channel id.
     """
 
     path: Path
@@ -233,8 +234,8 @@ def read_summary(stream: IO[bytes]) -> Summary | None:
     """Read the summary of a file that ends with the magic bytes, and verify its checksum.
 
     The MCAP format makes the summary and each of its parts optional, and other tools leave parts
-    out. Missing indexes of metadata and attachments are added from the start of
-    every record in the file.
+    out. If indexes of metadata or attachments are missing, they are rebuilt from the opcode and
+    length at the start of every record.
 
     Returns:
         The summary; None if it is missing, or lacks schemas, channels, chunk indexes or counts, so
@@ -275,7 +276,7 @@ def read_summary(stream: IO[bytes]) -> Summary | None:
 
 
 def _index_metadata(stream: IO[bytes], summary: Summary) -> None:
-    """Index all metadata and attachments of a file from the start of each record.
+    """Index all metadata and attachments of a file by the opcode and length of each record.
 
     Raises:
         LogError: A record extends beyond the end of the file.
@@ -296,7 +297,7 @@ def _index_metadata(stream: IO[bytes], summary: Summary) -> None:
 
 
 def message_counts(summary: Summary) -> dict[int, int]:
-    """Return the number of messages by channel id; changes to it change the summary."""
+    """Return the number of messages by channel id: the dictionary of the summary, not a copy."""
     if summary.statistics is None:
         summary.statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
     return summary.statistics.channel_message_counts
@@ -377,8 +378,8 @@ def scan(stream: IO[bytes], path: Path) -> Contents:
 
     Raises:
         NothingWrittenError: The file ends before its first complete record.
-        LogError: The file is not an MCAP file, or is damaged where no truncation explains it: it
-            was closed, or a valid chunk follows the damage.
+        LogError: The file is not an MCAP file, or is damaged in a way that truncation does not
+            explain: the file was closed, or a valid chunk follows the damage.
     """
     size, is_closed = check_magic(stream)
     contents, problem = Contents(path, size, complete=False), "it is cut off"
@@ -420,7 +421,7 @@ def _add_record(
     """Add a record to the contents of a file, and move the stream to the next record.
 
     Raises:
-        LogError: The record is damaged or misplaced; the contents are unchanged.
+        LogError: The record is damaged or misplaced; `contents.end` is unchanged.
     """
     summary, end = contents.summary, start + length
     record_at(type(record), stream, start, length)
@@ -476,7 +477,7 @@ def _add_section(contents: Contents, start: int, length: int, stream: IO[bytes])
 
 
 def _add_message_index(contents: Contents, record: MessageIndex, start: int, end: int) -> None:
-    """Add the message index of a channel that another tool has written after the last chunk.
+    """Add a message index after the last chunk, as other tools write it for one channel.
 
     Other tools order channels and entries differently. An index that does not match the messages
     of the chunk is ignored, and `finish_log` replaces it.

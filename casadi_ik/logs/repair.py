@@ -67,7 +67,8 @@ class RepairResult:
         changed: False if the log was complete.
         chunks: Number of complete chunks.
         messages: Number of messages.
-        cut: Size of the incomplete end that was removed; 0 if only the summary was missing [bytes].
+        cut: Size of the bytes that were removed after the last complete record [bytes]; 0 if the
+            log was complete or only its summary was replaced.
     """
 
     path: Path
@@ -113,7 +114,7 @@ def _write_tail(contents: Contents) -> int:
         Size of the data that were replaced [bytes].
 
     Raises:
-        LogError: Another writer has locked the file.
+        LogError: Another writer has locked the file or has changed its size.
     """
     tail = b""
     if contents.unindexed_runs:
@@ -175,12 +176,12 @@ def merge_logs(shards: Paths, target: str | os.PathLike[str]) -> MergeResult:
 
     Args:
         shards: Complete logs (see `finish_log`) or folders of them with the same robot, seed, clock
-            and fields of each method.
+            (`t0_ns`, `slot_ns`) and fields of each method.
         target: Path of the merged log, which appears there once it is complete.
 
     Raises:
         LogError: A shard is missing, damaged or incomplete, contradicts the first shard, or holds a
-            solve of another shard; or the target cannot be written.
+            solve that another shard also holds; or the target cannot be written.
 
     Example:
         >>> merged = ik.logs.merge_logs(["cup.mcap"], "all.mcap")
@@ -371,7 +372,7 @@ def _same_fields(first: Schema, second: Schema) -> bool:
 
 
 def _ranges(numbers: Counts) -> list[list[int]]:
-    """Return (first, last) of every range in sorted numbers, at least one."""
+    """Return [first, last] of every run of consecutive numbers; `numbers` is sorted, not empty."""
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     return [[int(run[0]), int(run[-1])] for run in runs]
 

@@ -77,8 +77,9 @@ def grasp(args: Arguments) -> CommandResult:
     by load (weight that a unit of grip force holds), by clearance, by the margin to
     joint limits, or by the distance from --q0.
 
-    FOUND.npz holds points, normals and balls (k, f, 3) in the format of `casadi-ik
-    batch` and `choose`, q, load, closure and clearance, and the ranked solutions for
+    FOUND.npz holds points and normals (k, f, 3), and tangents, lines, planes or balls
+    if contacts have them, in the format of `casadi-ik batch` and `choose`. It also holds
+    q, load, closure and clearance of each grasp, and the ranked solutions for
     `casadi-ik reach` and `view`. If no grasp is found, no file is written.
 
     exit codes: 0 at least one found, 1 none (see report), 2 bad input
@@ -187,7 +188,7 @@ def reach_map(args: Arguments) -> CommandResult:
 
     Every palm pose is REACHABLE (with joint positions as a witness, which forward
     kinematics confirms), UNREACHABLE (refuted by interval arithmetic) or OPEN. For an
-    arm without an exact closed form, the solver searches witnesses within its
+    arm without an exact closed form, the solver searches for witnesses within its
     tolerance, and nothing is refuted. Collisions are not considered.
 
     MAP.npz holds positions, rotations, code (0 OPEN, 1 REACHABLE, 2 UNREACHABLE) and q.
@@ -234,7 +235,7 @@ def reach_map(args: Arguments) -> CommandResult:
     opt.picture("--picture", "heat map of the bases"),
 )
 def place_base(args: Arguments) -> CommandResult:
-    r"""Place an upright base so that the arm reaches most palm poses.
+    r"""Place an upright base so that the arm reaches as many palm poses as possible.
 
     Examples:
       casadi-ik place-base palms.npz --robot ur5e --region -1 -1 0 1 1 0 \
@@ -244,8 +245,8 @@ def place_base(args: Arguments) -> CommandResult:
     best base reaches, and a proved upper bound for all bases of the region. Collisions
     are not considered.
 
-    PLACE.json holds pose (4, 4), base (x, y, z [m], yaw [rad]), count, upper_bound,
-    reached (k) and q (null where not reached).
+    PLACE.json holds robot (its name), pose (4, 4), base (x, y, z [m], yaw [rad]), count,
+    upper_bound, reached (k) and q (null where not reached).
 
     exit codes: 0 a palm pose is reached, 1 none, 2 bad input
     """

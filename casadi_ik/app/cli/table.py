@@ -12,8 +12,8 @@ To add a command, write its function with its options in a module of this packag
 
 and add a row to `COMMANDS`. The module is imported when the command is called. Each value is
 parsed by `parse` of its option; a `ValueError` becomes one line on stderr that starts with the
-name of the option. Lengths and angles reach the function in m and rad whatever `--mm` and `--deg`
-are.
+name of the option. Lengths and angles reach the function in m and rad, with or without `--mm` and
+`--deg`; motor positions are converted once the robot is known.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ class Scene3D:
         Args:
             height: Height of the floor [m].
             drawables: Drawables that cast the shadow.
-            extent: (k, 3) Points above the floor [m]; None: those of the drawables.
+            extent: (k, 3) Points that the floor extends below [m]; None: vertices of the drawables.
             dark: Use a floor for dark backgrounds.
             texels: Size of the floor's texture along each side.
         """
@@ -176,7 +176,10 @@ class Scene3D:
         return (normalised[:, :2] * [1, -1] + 1) / 2 * size
 
     def render(self, *groups: str) -> Image:
-        """Return an image (h, w, 4) of some groups, or all, blended with white."""
+        """Return an image (h, w, 4) of the named groups, or of all if none is named.
+
+        The colours are blended with white.
+        """
         for name, actors in self._groups.items():
             for actor in actors:
                 actor.visibility = not groups or name in groups

@@ -16,7 +16,7 @@ static int are_finite(const double *x, int count) {
   return 1;
 }
 
-/* Returns 1 if a vector is free, 0 if it is set, -1 if it is invalid. */
+/* Returns 1 if a vector is free (all NaN), 0 if it is set (all finite), -1 if it is invalid. */
 static int free_state(const double *vector) {
   const int missing = (vector[0] != vector[0]) + (vector[1] != vector[1]) + (vector[2] != vector[2]);
   if (missing) return missing == 3 ? 1 : -1;
@@ -27,7 +27,8 @@ static void copy(double *to, const double *from, int count) {
   memcpy(to, from, (size_t) count * sizeof *to);
 }
 
-/* Sets the contacts of the next cycle; returns 0 if they are invalid. */
+/* Sets the contacts of the next cycle; returns the number of contact points, 0 if the contacts are
+ * invalid or have no point. */
 static int set_contacts(@PREFIX@_follower *follower, const double *points, const double *normals) {
   static const double any[] = {1.0, 0.0, 0.0}, none[] = {0.0, 0.0, 0.0};
   double *parameters = follower->parameters;
@@ -50,13 +51,13 @@ static int set_contacts(@PREFIX@_follower *follower, const double *points, const
       is_zero &= point[k] == 0;
     }
   }
-  /* Contact points of a hand that a tracker has lost. */
+  /* A tracker that has lost the hand reports points that are all zero or all the same. */
   if (is_zero || (n_points > 1 && coincide)) return 0;
   return n_points;
 }
 
 #if MOVES_PALM
-/* Returns 1 if a pose is a rigid motion. */
+/* Returns 1 if a pose (its three axes, then its position) is a rigid motion. */
 static int is_rigid(const double *r) {
   const double determinant = r[0] * (r[4] * r[8] - r[5] * r[7]) - r[1] * (r[3] * r[8] - r[5] * r[6])
                       + r[2] * (r[3] * r[7] - r[4] * r[6]);
@@ -89,7 +90,7 @@ static int set_palm(@PREFIX@_follower *follower, const double *palm) {
 #endif
 }
 
-/* Computes the positions at which the motors can stop. */
+/* Computes the nearest positions at which the motors can come to rest. */
 static void posture_at_rest(const @PREFIX@_follower *follower, double *q) {
   int i;
   for (i = 0; i < N_MOTORS; ++i) {
@@ -114,7 +115,7 @@ static void clear_target(@PREFIX@_follower *follower) {
   state[STATE_LOCKED_ON] = 0.0;
 }
 
-/* Computes a step; returns 0 if a number is out of range. */
+/* Computes a step; returns 0 if the result is not finite. */
 static int compute_step(@PREFIX@_follower *follower, const double *state) {
   const double *arg[] = {state, follower->parameters};
   double *res[] = {follower->new_state, follower->record};
@@ -122,7 +123,7 @@ static int compute_step(@PREFIX@_follower *follower, const double *state) {
   return is_finite(follower->record[RECORD_CHECKSUM]);
 }
 
-/* Computes a step from rest at a posture; returns 0 if a number is out of range. */
+/* Computes a step from rest at a posture; returns 0 if the result is not finite. */
 static int compute_step_from_rest(@PREFIX@_follower *follower, const double *q) {
   double state[sizeof follower->state / sizeof(double)];
   memset(state, 0, sizeof state);
@@ -131,7 +132,9 @@ static int compute_step_from_rest(@PREFIX@_follower *follower, const double *q) 
   return compute_step(follower, state);
 }
 
-/* Computes the contacts and the palm of a posture: the residual of a target at the origin. */
+/* Computes the contacts and the palm of a posture as the residual of a target at the origin, with
+ * normals (1, 0, 0): points over LENGTH, normals minus (1, 0, 0), palm point over LENGTH, and
+ * palm axes. */
 static void measure(@PREFIX@_follower *follower, const double *q, double *residual) {
   double parameters[sizeof follower->parameters / sizeof(double)];
   double record[sizeof follower->record / sizeof(double)];
@@ -188,7 +191,8 @@ static void turn_between(const double *a, const double *b, double *turn) {
   turn[7] += v[0];
 }
 
-/* Displaces the target as since the clutch was closed; anchors targets that are new. */
+/* Displaces the target by the offsets and turns since the follower was resumed. A contact or palm
+ * that is new gets an offset and turn that lead to the posture at which the motors can rest. */
 static void displace(@PREFIX@_follower *follower) {
   double *parameters = follower->parameters, *weights = parameters + PARAMETER_WEIGHTS;
   int i, k, is_new = 0;
@@ -253,9 +257,10 @@ static void displace(@PREFIX@_follower *follower) {
 #endif
 }
 
-/* Recovery of a follower that is stuck, as in motion/recovery.py; all lines count as free.
- *
- * Returns the distance of two postures. */
+/* Recovery of a follower that is stuck, as in motion/recovery.py without collision checks: every
+ * straight line between two postures counts as free. */
+
+/* Returns the distance of two postures: the largest difference of a motor in its unit. */
 static double distance(const double *a, const double *b) {
   double largest = 0;
   int i;
@@ -263,11 +268,13 @@ static double distance(const double *a, const double *b) {
   return largest;
 }
 
+/* Returns the largest step that ends at a distance if each later step is smaller by a change. */
 static double brake(double distance, double change) {
   const double u = distance / change, steps = floor((sqrt(1 + 8 * u) - 1) / 2);
   return change * (u + steps * (steps + 1) / 2) / (steps + 1);
 }
 
+/* Restarts the count of cycles in which the error does not decrease. */
 static void start_clock(@PREFIX@_recovery *recovery, double least_ratio) {
   recovery->least_since = least_ratio;
   recovery->cycles_stuck = 0;
@@ -279,7 +286,7 @@ static void follow_contacts(@PREFIX@_recovery *recovery) {
   start_clock(recovery, INFINITY);
 }
 
-/* Computes the next step of motors that return. */
+/* Computes the next step of motors that brake, or that return along the line. */
 static void next_step(@PREFIX@_follower *follower, double *step) {
   @PREFIX@_recovery *recovery = &follower->recovery;
   const double *state = follower->state;
@@ -331,7 +338,8 @@ static void extend_trail(@PREFIX@_recovery *recovery, const double *q) {
   recovery->cycles_to_check = cycles < recovery->check_cycles ? recovery->check_cycles : (int64_t) cycles;
 }
 
-/* Compares postures of the trail once the error has not decreased for a while. */
+/* Once the error has not decreased for a while, searches the trail for a posture from which it gets
+ * smaller, and starts the return to that posture. */
 static void check_progress(@PREFIX@_follower *follower) {
   @PREFIX@_recovery *recovery = &follower->recovery;
   const double ratio = follower->record[RECORD_ERROR_RATIO];
@@ -384,7 +392,7 @@ static void start_line(@PREFIX@_follower *follower) {
   else follow_contacts(recovery);
 }
 
-/* Evaluates the result of a cycle. */
+/* Advances a return after a cycle, or extends the trail and checks the progress. */
 static void update_recovery(@PREFIX@_follower *follower) {
   @PREFIX@_recovery *recovery = &follower->recovery;
   if (recovery->is_returning) {
@@ -428,7 +436,7 @@ static void return_to_limits(@PREFIX@_follower *follower) {
   }
 }
 
-/* Makes a step; returns 0, with the state unchanged, if a number is out of range. */
+/* Makes a step; returns 0, with the state unchanged, if the result is not finite. */
 static int step(@PREFIX@_follower *follower) {
   if (follower->is_beyond_limits) return_to_limits(follower);
   if (follower->is_paused || follower->recovery.is_returning) {

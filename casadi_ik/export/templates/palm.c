@@ -2,7 +2,7 @@
 /* Computes the contacts of a hand posture at a palm pose; returns 0, or the status of bad input. */
 int @PREFIX@_touched(@PREFIX@_solver *solver, const scalar *palm, const scalar *posture,
                      scalar *points, scalar *normals) {
-  scalar q[N_MOTORS], rotation[9];
+  scalar q[N_MOTORS], rotation[9]; /* from the palm at home to the given palm pose */
   int i, k, m, is_valid = 1;
   memcpy(q, HOME, sizeof q);
   for (i = 0; i < N_MOTORS; ++i) {

@@ -43,8 +43,9 @@ class Trajectory:
         q: (s + 1, n) actuator positions [rad or m].
         points: (s + 1, 3) contact point in the frame of the target [m].
         error: (s + 1, m) rows of the task, desired minus current [m, rad].
-        error_norm: (s + 1,) their norm; of a pose the screw error norm of Chandra eq. (17).
-        sigma: (s + 1,) smallest singular value of the Jacobian over half ranges.
+        error_norm: (s + 1,) norm of these rows; for a pose the screw error norm, Chandra eq. (17).
+        sigma: (s + 1,) smallest singular value of the scaled Jacobian: columns times half the
+            ranges of the actuators, position rows divided by `length`.
         status: `SOLVED` if the error norm fell below the tolerance, else `ITERATION_LIMIT`, or
             `INVALID`.
 
@@ -120,10 +121,10 @@ class ScrewControl:
             period: Time between two steps [s].
             centring: Fraction of the distance to mid-range that each actuator moves per step, as
                 far as the task permits; 0: actuators that do not serve the task do not move.
-            damping: Damping of the least squares [unit of a singular value of J over half ranges].
-            length: Length with the weight of a radian [m]. It matters only for tasks that cannot be
-                met exactly. The paper adds m and rad without weights: 1.
-            speed: Largest speed of an actuator, () or (n,) [unit/s]; None: unlimited.
+            damping: Damping of the least squares [unit of `Trajectory.sigma`].
+            length: Length that weighs as much as a radian [m]. It matters only for tasks that
+                cannot be met exactly. The paper adds m and rad without weights: 1.
+            speed: Largest speed of an actuator, () or (n,) [rad/s or m/s]; None: unlimited.
             resolution: Increments of actuator commands, () or (n,), counted from the lower limit
                 [rad or m]; None or 0: continuous.
             compiled: False uses CasADi's virtual machine, which is slower and gives the same
@@ -163,14 +164,14 @@ class ScrewControl:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Settings of a run except target and start, as stored in the log."""
+        """Settings of a run except target, start and tolerance, as stored in the log."""
         task = {"kind": self.task.kind, "finger": self.task.finger}
         task |= {"relative_to": self.task.relative_to, "axis": self.task.axis}
         numbers = {name: np.asarray(value).tolist() for name, value in self._numbers.items()}
         return {"method": "screw-control", "task": task, "period": self.period, **numbers}
 
     def target(self, q: ArrayLike) -> dict[str, Array]:
-        """Return the target that a posture meets.
+        """Return the target that a configuration meets.
 
         Args:
             q: (n,) actuator positions [rad or m].
@@ -297,7 +298,7 @@ class ScrewControl:
         trajectory: Trajectory,
         rows: NDArray[Any],
     ) -> None:
-        """Write a run as one solve of a log with free contacts."""
+        """Write a run to a log as one solve, with free contacts instead of the task's target."""
         n, count = len(self.robot.fingers), np.array([len(rows)])
         free = np.full((1, n, 3), np.nan)
         batch = BatchSolution(
@@ -361,7 +362,7 @@ def _target_kernel(step: ScrewControlStep, compiled: bool) -> FunctionKernel:
 def _number(
     name: str, value: Any, *, above: float = -math.inf, lower: float = -math.inf, upper=math.inf
 ) -> float:
-    """Return a finite number > above in [lower, upper].
+    """Return a finite number that is > `above` and within [`lower`, `upper`].
 
     Raises:
         InputError: The value is not such a number.

@@ -27,22 +27,22 @@ POSE_ANGLE_ERROR = float(np.deg2rad(3.0))
 
 @dataclass(frozen=True, eq=False)
 class FoundGrasp:
-    """A grasp that the arm-hand can reach and hold.
+    """A grasp with which the arm-hand can reach and hold an object.
 
     Attributes:
         grasp: Contacts in the base frame, with the object's name and pose, the posture of the hand,
             and the hand before it closes (`pregrasp`) and as it squeezes (`squeeze`).
         solution: Solution in the scene.
         load: Weight held by friction in the worst of six directions per newton of squeeze (sum of
-            the normal forces). The displacement of the object, as pads roll and motors yield like
-            springs, reduces it: by half at 20 mm or 30 deg [N/N].
+            the normal forces) [N/N]. Pads that roll and motors that yield like springs let the
+            object move, which reduces the load: by half at 20 mm or 30 deg.
         closure: Load in the worst direction of forces and torques (about the centre of the object,
             divided by half its size); positive for force closure [N/N].
         score: Score of the ranking; higher is better.
-        forces: Force (3,) of each fingertip on the object that squeezes it, base frame. The object
-            stays at rest, and resists any pull best. The normal components sum to 1 N.
+        forces: Squeezing force (3,) of each fingertip on the object, base frame. These forces are
+            in balance and best resist a pull in any direction; their normal components sum to 1 N.
         most_squeeze: Maximum sum of normal forces within the efforts of the motors [N]; inf if the
-            robot's description has no `effort` of its joints.
+            robot's description gives no `effort` for its joints.
     """
 
     grasp: Grasp
@@ -130,7 +130,7 @@ class FoundGrasps(Sequence[FoundGrasp]):
             angle: Rotation of the object, about random axes [rad].
             hold: Mass [kg] that the contacts have to hold, and the squeeze [N], as for
                 `Solver.grasps_of`; None: the contacts have to be force-closed.
-            samples: Number of displacements of each grasp.
+            samples: Number of displacements, the same ones for every grasp.
             seed: Seed of the random directions.
 
         Returns:
@@ -205,7 +205,8 @@ OPENING_TRAVEL, CLOSING_TRAVEL, PATH_POSITIONS = 0.020, 0.020, 33
 """Travel of fingertips before and beyond their contacts [m], and number of positions on it."""
 
 MAX_FACE_LEAN = float(np.deg2rad(45.0))
-"""Maximum lean at which a plane pad touches with its face [rad]."""
+"""Maximum angle between pad normal and inward surface normal at which a flat pad touches with its
+face [rad]."""
 
 
 def robustness(
@@ -221,8 +222,8 @@ def robustness(
 
     The palm stays at its planned pose. Each finger of the grasp closes from `OPENING_TRAVEL` before
     its contact until it touches or is `CLOSING_TRAVEL` beyond it. The hand closes if the resulting
-    contacts resist any small force and torque. Fingers that share a motor are treated
-    independently.
+    contacts are force-closed and, if `hold` is given, hold the mass. Fingers that share a motor are
+    treated independently.
 
     Args:
         robot: The robot.
@@ -244,6 +245,7 @@ def robustness(
     path = np.concatenate([table.opened(hands, float(opening)).hand for opening in openings])
     points, normals, linear, angular = table.pads(path)
     fingers = np.flatnonzero(touches[0])
+    # Axes: k displacements, s positions on the path, c fingers of the grasp, m motors.
     # Jacobians (s, c, 3, m) in the planned frame of the object.
     linear, angular = (palm[:3, :3] @ jacobian[:, fingers] for jacobian in (linear, angular))
     motors = [robot.description.actuators[i] for i in table.motors]
