@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
-LIMITS = {"casadi_ik": 75, "docs": 1, "page": 0, "studies": 10, "tests": 8, "tools": 4}
+LIMITS = {"casadi_ik": 46, "docs": 1, "page": 0, "studies": 10, "tests": 8, "tools": 4}
 """Maximum number of vague names and summaries by folder."""
 
 VAGUE_NAMES = frozenset(

@@ -33,7 +33,7 @@ from casadi_ik.app.drawing.drawables import (
 )
 from casadi_ik.app.drawing.surfaces import arrow, ball
 from casadi_ik.app.pictures.charts import new_figure, save_picture
-from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, corner_points
+from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, vertices_of
 from casadi_ik.collision.clearance import closest_points
 from casadi_ik.files.arrays import Array
 
@@ -86,7 +86,7 @@ def shot(
             if closest is not None:
                 stage.add("nearest pair", clearance_marks(closest, show_shapes=True), 0.6)
         stage.add_floor(ground_height(robot, scene), links + objects + obstacles)
-        stage.aim(view, corner_points(links + objects + obstacles), pixels, (0.03, 0.03))
+        stage.aim(view, vertices_of(links + objects + obstacles), pixels, (0.03, 0.03))
         return np.clip(composite(1.0, stage.render()), 0.0, 1.0)
 
 
@@ -156,7 +156,7 @@ def contacts(path: Path) -> None:
             stage.add("object", objects, 0.5)
             stage.add("object marks", contact_targets(grasp))
             stage.add("frame", axes_drawn)
-            stage.aim(camera, corner_points(framed + objects + axes_drawn), pixels, (0.10, 0.14))
+            stage.aim(camera, vertices_of(framed + objects + axes_drawn), pixels, (0.10, 0.14))
             image = np.clip(composite(1.0, stage.render()), 0.0, 1.0)
             ends = stage.project(np.array([point for _, point, _ in labels]))
         axes = figure.add_axes(box)
@@ -265,7 +265,7 @@ def unreachable(path: Path) -> None:
         stage.add("marks", contact_targets(far_grasp))
         stage.add("reach", shell, 0.10)
         stage.add_floor(0.0, bodies + objects)
-        stage.aim(view, corner_points(bodies + objects), pixels, (0.12, 0.06))
+        stage.aim(view, vertices_of(bodies + objects), pixels, (0.12, 0.06))
         image = np.clip(composite(1.0, stage.render()), 0.0, 1.0)
         ends = stage.project(np.array([wrist, far_pose[:3, 3]]))
     figure = new_figure(10.0, 6.4, dpi=100)

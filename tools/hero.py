@@ -30,7 +30,7 @@ from casadi_ik.app.drawing.drawables import (
 )
 from casadi_ik.app.pictures.charts import save_picture
 from casadi_ik.app.pictures.pictures import encode_gif
-from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, corner_points
+from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, vertices_of
 from casadi_ik.files.arrays import Array
 
 ROBOT, GRASP = "panda+allegro_right", "allegro_cup"
@@ -132,7 +132,7 @@ def pictures(
     assert cup is not None
     robots = [bodies_at(robot, q) for q, _, _ in frames]
     swept = [drawable for body in robots[::4] for drawable in body]
-    workspace = corner_points([*swept, *post])
+    workspace = vertices_of([*swept, *post])
     close_up = 0.20 * np.vstack([np.eye(3), -np.eye(3)])
     images: tuple[list[Image], list[Image]] = ([], [])
     with closing(Scene3D()) as stage:

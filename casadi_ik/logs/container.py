@@ -503,7 +503,9 @@ def _add_definition(summary: Summary, record: Schema | Channel) -> None:
     """
     records: Any = summary.schemas if isinstance(record, Schema) else summary.channels
     if records.setdefault(record.id, record) != record:
-        raise LogError(f"the log is damaged: {type(record).__name__} {record.id} is defined twice")
+        raise LogError(
+            f"the log is damaged: {type(record).__name__} {record.id} has two definitions"
+        )
 
 
 def _add_index(summary: Summary, item: Attachment | Metadata, offset: int, length: int) -> None:

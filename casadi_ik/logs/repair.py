@@ -124,7 +124,7 @@ def _write_tail(contents: Contents) -> int:
         if not lock_file(stream.fileno(), contents.path) or (
             stream.seek(0, os.SEEK_END) != contents.size
         ):
-            raise LogError("cannot finish the log: another writer has locked it")
+            raise LogError("cannot finish the log: another process has locked or changed it")
         stream.truncate(contents.end)
         stream.seek(contents.end)
         stream.write(tail)
@@ -384,12 +384,13 @@ def _attachments(shards: Sequence[Shard]) -> list[Attachment]:
         LogError: Two shards have different attachments of one name.
     """
     attachments: dict[str, Attachment] = {}
+    owners: dict[str, Path] = {}
     for shard in shards:
         for attachment in shard.attachments().values():
             first = attachments.setdefault(attachment.name, attachment)
+            owner = owners.setdefault(attachment.name, shard.path)
             if first.data != attachment.data:
                 raise LogError(
-                    f"{shard.path}: the attachment {attachment.name!r} differs from that of"
-                    f" {shards[0].path}"
+                    f"{shard.path}: the attachment {attachment.name!r} differs from that of {owner}"
                 )
     return list(attachments.values())

@@ -55,6 +55,12 @@ class Branch:
         q: (n,) configuration [rad or m].
         gain: Decrease of the largest error over its tolerance.
         travel: Largest distance of a motor from its present position [rad or m].
+
+    Example:
+        >>> from casadi_ik.motion import Branch
+        >>> branch = Branch(robot.home, gain=0.5, travel=0.8)
+        >>> branch.q.shape == robot.home.shape
+        True
     """
 
     q: Array

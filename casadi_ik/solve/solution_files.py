@@ -29,9 +29,10 @@ def solution_data(solution: Solution) -> dict[str, Any]:
     names += ["clearance", "closest", "collision"] if solution.clearance is not None else []
     data = to_json({name: getattr(solution, name) for name in names}, infinite=lambda _: None)
     if solution.diagnosis is not None:
-        properties = ("established", "reliefs", "freed", "lines")
+        properties = ("established", "reliefs", "released", "lines")
         evidence = {name: getattr(solution.diagnosis, name) for name in properties}
         data["diagnosis"] |= to_json(evidence, infinite=lambda _: None)
+        data["diagnosis"]["freed"] = data["diagnosis"]["released"]  # deprecated key
     for contact in data["contacts"].values():
         del contact["tolerance"]
     return data

@@ -33,8 +33,8 @@ s = ca.SX.sym("s")
 both = ca.Function("both", [s], [follow(joint, s), coupling_rate(joint, s)])
 source, step = rng.uniform(-1, 1, 50), 1e-6
 position, rate = (np.array(value).ravel() for value in both(source[None]))
-np.testing.assert_allclose(joint.coupling.followed(source), position, atol=1e-14)
-ahead, behind = (joint.coupling.followed(source + side) for side in (step, -step))
+np.testing.assert_allclose(joint.coupling.joint_position(source), position, atol=1e-14)
+ahead, behind = (joint.coupling.joint_position(source + side) for side in (step, -step))
 np.testing.assert_allclose(rate, (ahead - behind) / (2 * step), atol=1e-8)
 
 motors = ca.SX.sym("q", len(q))
@@ -99,7 +99,7 @@ def test_an_unknown_kind_is_an_error(coupled_robot):
     with pytest.raises(ik.errors.UnsupportedError, match="Wire"):
         has_toggle(wired)
     with pytest.raises(NotImplementedError, match="Wire"):
-        wired.coupling.followed(np.zeros(1))
+        wired.coupling.joint_position(np.zeros(1))
     joints = coupled_robot.description.joints
     described = dataclasses.replace(
         coupled_robot.description,

@@ -91,7 +91,7 @@ def test_numbers_match_the_graphs(rng):
         graph = ca.Function("graph", [q], [follow(joint, q)])
         values = rng.uniform(low, high, 500)
         expected = np.array(graph(values[None])).ravel()
-        np.testing.assert_allclose(coupling.followed(values), expected, atol=1e-12)
+        np.testing.assert_allclose(coupling.joint_position(values), expected, atol=1e-12)
 
 
 def test_non_monotonic_coupling_keeps_the_interval_of_home(tmp_path):

@@ -165,7 +165,7 @@ def test_polynomial_bounds_hold(coefficients: list[float], ends: list[float]) ->
     )
     interval = COUPLING_ROWS[Polynomial].interval(coupling, Interval(ca.SX(low), ca.SX(high)))
     graph = [float(ca.evalf(end)) for end in (interval.lower, interval.upper)]
-    values = coupling.followed(np.linspace(low, high, 101))
+    values = coupling.joint_position(np.linspace(low, high, 101))
     for lower_bound, upper_bound in (graph, (value[0][0], value[1][0])):
         assert lower_bound <= values.min()
         assert values.max() <= upper_bound

@@ -280,7 +280,9 @@ def finish(args: Arguments) -> CommandResult:
             entries = {"result": f"not changed: {str(error).removeprefix(f'{path}: ')}"}
         else:
             repair = (
-                f"{_size(result.cut)} of a torn tail removed" if result.cut else "summary added"
+                f"{_size(result.cut)} of an incomplete end removed"
+                if result.cut
+                else "summary added"
             )
             counts = (
                 f"{count_text(result.chunks, 'chunk')}, {count_text(result.messages, 'message')}"

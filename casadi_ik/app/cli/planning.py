@@ -171,7 +171,7 @@ def grasps_npz(grasps: FoundGrasps, fingers: tuple[str, ...]) -> bytes:
         parse=lambda words: opt.numbers(words, 6, "x y z x y z"),
     ),
     Option("--orientations N", "number of palm orientations", 32, opt.integer(1)),
-    Option("--resolution M", "distance of positions [m]", 0.05, opt.positive),
+    Option("--resolution M", "distance of neighbouring positions [m]", 0.05, opt.positive),
     Option("--meaning exact|tolerance", "palm pose itself, or within the solver's tolerance"),
     opt.LIMIT_MODE,
     Option("--jobs N", "threads", 1, opt.integer(1)),
@@ -262,7 +262,7 @@ def place_base(args: Arguments) -> CommandResult:
         placement = Solver(robot, limits=args.limits).place_base(
             palms, np.reshape(args.region, (2, 3)), args.resolution, args.max_time
         )
-    arms = zip(placement.q.tolist(), placement.reached.tolist(), strict=True)
+    rows = zip(placement.q.tolist(), placement.reached.tolist(), strict=True)
     data = {
         "robot": robot.name,
         "pose": placement.pose.tolist(),
@@ -270,7 +270,7 @@ def place_base(args: Arguments) -> CommandResult:
         "count": placement.count,
         "upper_bound": placement.upper_bound,
         "reached": placement.reached.tolist(),
-        "q": [q if is_reached else None for q, is_reached in arms],
+        "q": [q if is_reached else None for q, is_reached in rows],
     }
     write_json(args.out, data)
     if draw is not None:

@@ -41,7 +41,7 @@ COMMANDS = {
     "batch": ("batch.batch", "solve many targets of one robot"),
     "follow": ("motion.follow", "follow a moving hand, or moving contacts"),
     "reach": ("motion.reach", "plan a timed motion to a grasp"),
-    "place-base": ("planning.place_base", "place the base to reach most palm poses"),
+    "place-base": ("planning.place_base", "find the base that reaches most of the palm poses"),
     "map": ("planning.reach_map", "map the palm poses that an arm can reach"),
     "grasp": ("planning.grasp", "find feasible grasps of an object's mesh"),
     "choose": ("solve.choose", "rank candidate grasps of an object"),
@@ -64,7 +64,7 @@ COMMANDS = {
     "log compare": ("log.compare", "compare two methods on the same targets"),
     "log report": ("log.report", "write a study as an HTML page"),
     "log export": ("log.export", "write tables, or a file for a viewer"),
-    "log finish": ("log.finish", "repair logs in place whose writer was killed"),
+    "log finish": ("log.finish", "repair, in place, logs whose writer was killed"),
     "log merge": ("log.merge", "merge the shards of a study without recompression"),
     "view": ("view.view", "open the interactive viewer, or play a log"),
     "completion": ("lists.completion", "print TAB completion for bash, zsh or fish"),
@@ -100,7 +100,7 @@ Examples:
   casadi-ik log report study/ --out report.html      study as a page
   casadi-ik log export cup.mcap --solve 3 --out view.mcap      for Foxglove
   casadi-ik log export study/ --what solves --out solves.parquet
-  casadi-ik log finish torn.mcap                     repair a torn log
+  casadi-ik log finish cut.mcap                      repair a truncated log
   casadi-ik log merge a.mcap b.mcap --out all.mcap
 
 A folder means all logs in it.

@@ -13,7 +13,7 @@ from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import View, bodies_at, close_view, overview, scene_drawables
 from casadi_ik.app.pictures.charts import DPI, new_figure, save_picture
 from casadi_ik.app.pictures.pictures import add_grasp, add_image, pixel_size
-from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, corner_points, render_lock
+from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, render_lock, vertices_of
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -64,7 +64,7 @@ def draw_alternatives(
         raise InputError("alternatives: found none; expected at least one")
     first = alternatives[0].q
     camera_view = view or overview(robot.contacts(first)[0].mean(axis=0), close_view(robot, first))
-    points = corner_points(
+    points = vertices_of(
         [body for alternative in alternatives for body in bodies_at(robot, alternative.q)]
     )
 
@@ -119,7 +119,7 @@ def draw_grasps(
             groups = add_grasp(scene3d, robot, candidate.q, candidate.grasp, colors, floor=False)
             if scene is not None:
                 scene3d.add("scene", scene_drawables(scene, candidate.grasp.object))
-            points = corner_points(groups["hand"] + groups["object"])
+            points = vertices_of(groups["hand"] + groups["object"])
             scene3d.aim(close_view(robot, candidate.q), points, pixels, (0.04, 0.04))
             image = composite(1.0, scene3d.render("scene"), 0.35) if scene is not None else 1.0
             image = composite(image, scene3d.render("wrist"), 0.3)

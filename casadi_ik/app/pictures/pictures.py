@@ -35,7 +35,7 @@ from casadi_ik.app.drawing.drawables import (
 )
 from casadi_ik.app.drawing.surfaces import arrow, ball
 from casadi_ik.app.pictures.charts import DARK, DPI, LIGHT, ChartTheme, new_figure, save_picture
-from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, corner_points, render_lock
+from casadi_ik.app.pictures.scene3d import Image, Scene3D, composite, render_lock, vertices_of
 from casadi_ik.collision.clearance import closest_points
 from casadi_ik.collision.scene import Scene
 from casadi_ik.files.arrays import Array
@@ -104,7 +104,7 @@ def draw_solution(
             _add_scene(scene3d, robot, solution, grasp, scene)
         view = view or close_view(robot, q)
         pixels = pixel_size(figure, ROBOT_BOX)
-        points = corner_points([drawable for group in groups.values() for drawable in group])
+        points = vertices_of([drawable for group in groups.values() for drawable in group])
         scene3d.aim(overview(_target_center(robot, q, grasp), view), points, pixels, (0.03, 0.10))
         image = composite(paper, scene3d.render("floor"), _edge_fade(pixels))
         image = composite(image, scene3d.render(*groups, "scene", "nearest", "touching"))
@@ -117,7 +117,7 @@ def draw_solution(
             drawable for drawable in objects_and_marks if _distances(drawable, palms).max() < 0.35
         ]
         pixels = pixel_size(figure, CLOSE_UP_BOX)
-        scene3d.aim(view, corner_points(groups["hand"] + nearby), pixels, (0.17, 0.02))
+        scene3d.aim(view, vertices_of(groups["hand"] + nearby), pixels, (0.17, 0.02))
         # The arm is translucent because it may occlude the hand.
         image = composite(paper, scene3d.render("wrist"), 0.3 * _edge_fade(pixels))
         image = composite(image, scene3d.render("hand", "object", "marks", "nearest", "touching"))
@@ -168,7 +168,7 @@ def show(
         scene3d = Scene3D(off_screen=not window)
         groups = add_grasp(scene3d, robot, q, grasp, dict.fromkeys(robot.fingers, palette.INK))
         view = overview(robot.contacts(q)[0].mean(axis=0), close_view(robot, q))
-        points = corner_points([drawable for group in groups.values() for drawable in group])
+        points = vertices_of([drawable for group in groups.values() for drawable in group])
         scene3d.aim(view, points, (1200, 900), (0.05, 0.05))
     if window:
         scene3d.plotter.show(auto_close=False)
@@ -218,7 +218,7 @@ def _motion_images(robot: ArmHand, q: Array, grasp: Grasp, scene: Scene | None) 
     marks = contact_marks(robot, end, grasp, dict.fromkeys(robot.fingers, palette.MET))
     images = []
     with render_lock, closing(Scene3D()) as scene3d:
-        points = corner_points(swept_bodies + object_drawables)
+        points = vertices_of(swept_bodies + object_drawables)
         scene3d.add("object", object_drawables, OPACITY["object"])
         scene3d.add("marks", marks)
         if scene is not None:
@@ -339,7 +339,7 @@ def _draw_hand_pads(figure: Figure, robot: ArmHand, bottom: float, height: float
         for drawable in bodies_at(robot, robot.home)
         if drawable.role == "hand"
     ]
-    size = float(np.ptp(corner_points(hand), axis=0).max())
+    size = float(np.ptp(vertices_of(hand), axis=0).max())
     frames, marks = to_palm @ robot.contact_frames(robot.home), []
     for name, frame in zip(robot.fingers, frames, strict=True):
         color = palette.TARGET if name == robot.description.named_thumb else palette.MET
@@ -353,7 +353,7 @@ def _draw_hand_pads(figure: Figure, robot: ArmHand, bottom: float, height: float
             scene3d.add("hand", hand, orient=robot.description.path is not None)
             scene3d.add("marks", marks)
             view = float(np.deg2rad(azimuth)), float(np.deg2rad(20.0))
-            scene3d.aim(view, corner_points(hand + marks), pixels, (0.12, 0.04))
+            scene3d.aim(view, vertices_of(hand + marks), pixels, (0.12, 0.04))
             # Pads are visible through the hand.
             image = composite(composite(1.0, scene3d.render("hand")), scene3d.render("marks"), 0.55)
             image = composite(image, scene3d.render("hand", "marks"), 0.45)

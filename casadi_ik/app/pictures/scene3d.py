@@ -109,7 +109,7 @@ class Scene3D:
             dark: Use a floor for dark backgrounds.
             texels: Size of the floor's texture along each side.
         """
-        points, grid = corner_points(drawables) if extent is None else extent, 0.25
+        points, grid = vertices_of(drawables) if extent is None else extent, 0.25
         low, high = points.min(axis=0), points.max(axis=0)
         center = np.array([*(low + high)[:2] / 2, height])
         radius = 0.35 + float(np.linalg.norm(high[:2] - low[:2])) / 2
@@ -200,7 +200,7 @@ def _smooth_mesh(drawable: Drawable, orient: bool) -> pv.PolyData:
     return mesh
 
 
-def corner_points(drawables: Sequence[Drawable]) -> Array:
+def vertices_of(drawables: Sequence[Drawable]) -> Array:
     """Return the (k, 3) vertices of drawables."""
     return np.concatenate([drawable.surface.points for drawable in drawables])
 

@@ -373,7 +373,8 @@ def _number(
         number = math.nan
     if math.isfinite(number) and number > above and lower <= number <= upper:
         return number
-    bounds = f" > {above}" if above > -math.inf else f" from {lower} to {upper}"
+    bounds = f" from {lower} to {upper}" if upper < math.inf else f" >= {lower}"
+    bounds = f" > {above}" if above > -math.inf else bounds
     raise InputError(f"{name}: found {value!r}, expected a number{bounds}")
 
 
