@@ -24,7 +24,7 @@ from runner.report import Metric, command, markdown_table, median_metric, progra
 from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
-from casadi_ik.files.arrays import Array
+from casadi_ik.files.arrays import Array, Bools
 
 ROBOTS = ("so101", "ur5e", "panda", "kuka_lwr_barrett")
 PERIOD = 0.01
@@ -130,7 +130,7 @@ def follow(part: Part) -> dict[str, Any]:
         | (np.abs(steps) > slack * PERIOD * follower.velocity)
         | (np.abs(changes) > slack * PERIOD**2 * follower.acceleration + 1e-15)
     )
-    is_still = (np.abs(steps) <= STILL).all(axis=1)
+    is_still: Bools = (np.abs(steps) <= STILL).all(axis=1)
     still_rows = np.flatnonzero(is_still)
     is_still[still_rows] = _can_move(robot, q[still_rows])
     windows = np.lib.stride_tricks.sliding_window_view(is_still, FREEZE).all(axis=1)

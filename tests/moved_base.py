@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
+from casadi_ik.files.reading import roll_pitch_yaw
 
 IDENTITY = np.eye(4)
 
@@ -88,4 +88,4 @@ def on_pedestal(
 
 def xyz_rpy(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the origin and the angles about fixed axes of a pose."""
-    return pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")
+    return pose[:3, 3], np.asarray(roll_pitch_yaw(pose[:3, :3]))

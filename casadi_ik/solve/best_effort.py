@@ -34,7 +34,7 @@ class BestEffort:
         InputError: A weight is negative or not a number, or all weights of a finger are zero.
 
     Example:
-        >>> by_position = ik.BestEffort(weights={"finger_1": (200.0, 0.5)})
+        >>> by_position = ik.BestEffort(weights={"finger_2": (200.0, 0.5)})
         >>> solution = solver.solve(grasp, best_effort=by_position)
         >>> solution.success  # options do not change solved grasps
         True

@@ -304,7 +304,9 @@ def test_page_works_in_a_browser(
     as_in_python(module / export_prefix(None, BODY))
     browser: Browser = request.getfixturevalue("browser")
     url = (out / "index.html").as_uri()
-    used_by_mouse(opened(browser, url, 900, 600), robot, browser, url)
+    assert opened(browser, url, 900, 600).evaluate("document.title").startswith("cup · ")
+    apple_page = opened(browser, f"{url}#robot={ROBOT}&grasp=apple", 900, 600)
+    used_by_mouse(apple_page, robot, browser, url)
     two_hands_hold(opened(browser, url, 900, 600))
     used_on_a_phone(opened(browser, url, 360, 740, phone=True))
 
