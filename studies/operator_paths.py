@@ -130,7 +130,7 @@ def follow(part: Part) -> dict[str, Any]:
         | (np.abs(steps) > slack * PERIOD * follower.velocity)
         | (np.abs(changes) > slack * PERIOD**2 * follower.acceleration + 1e-15)
     )
-    is_still: Bools = (np.abs(steps) <= STILL).all(axis=1)
+    is_still: Bools = np.asarray((np.abs(steps) <= STILL).all(axis=1))
     still_rows = np.flatnonzero(is_still)
     is_still[still_rows] = _can_move(robot, q[still_rows])
     windows = np.lib.stride_tricks.sliding_window_view(is_still, FREEZE).all(axis=1)
