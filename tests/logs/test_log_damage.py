@@ -146,7 +146,7 @@ def test_log_in_use_is_left_unchanged(tmp_path: Path) -> None:
             recorder.record(make_block(1000, first=first))
         while not path.stat().st_size:
             time.sleep(0.01)
-        with pytest.raises(errors.LogError, match="another writer"):
+        with pytest.raises(errors.LogError, match="locked"):
             logs.finish_log(path)
     assert not logs.finish_log(path).changed
     assert len(read_messages(path)) > 40_000
