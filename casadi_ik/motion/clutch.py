@@ -27,7 +27,7 @@ def turn_between(a: Array, b: Array) -> Array:
 class Clutch:
     """Displacement of targets such that the first target after a pause does not move the robot.
 
-    Points are translated, normals and palms are rotated as well. Each finger and palm is anchored
+    Points are translated, and normals and palms are rotated. Each finger and palm is anchored
     when its first target arrives.
     """
 
@@ -35,7 +35,7 @@ class Clutch:
         """Start without anchored targets."""
         self._robot = robot
         self._offsets = np.full((len(robot.fingers), 3), np.nan)
-        self._turns = np.full((len(robot.fingers), 3, 3), np.nan)
+        self._rotations = np.full((len(robot.fingers), 3, 3), np.nan)
         self._palms = dict[str | None, tuple[Array, Array]]()
 
     def displaced(
@@ -52,12 +52,12 @@ class Clutch:
         directions = np.full_like(points, np.nan) if normals is None else normals
         lengths = np.linalg.norm(directions, axis=1, keepdims=True)
         is_new_point = np.isnan(self._offsets[:, 0]) & np.isfinite(points).all(axis=1)
-        is_new_normal = np.isnan(self._turns[:, 0, 0]) & np.isfinite(1 / lengths[:, 0])
+        is_new_normal = np.isnan(self._rotations[:, 0, 0]) & np.isfinite(1 / lengths[:, 0])
         if is_new_point.any() or is_new_normal.any():
             tip_points, tip_normals = self._robot.contacts(q)
             self._offsets[is_new_point] = (tip_points - points)[is_new_point]
             for i in np.flatnonzero(is_new_normal):
-                self._turns[i] = turn_between(directions[i] / lengths[i], tip_normals[i])
+                self._rotations[i] = turn_between(directions[i] / lengths[i], tip_normals[i])
         displaced_palms = dict[str | None, Array]()
         for side, pose in palms.items():
             if side not in self._palms:
@@ -70,6 +70,6 @@ class Clutch:
         points = np.where(np.isnan(self._offsets), points, points + self._offsets)
         if normals is None:
             return points, None, displaced_palms
-        turned = np.einsum("fij,fj->fi", self._turns, normals)
-        normals = np.where(np.isnan(self._turns[:, 0]), normals, turned)
+        rotated = np.einsum("fij,fj->fi", self._rotations, normals)
+        normals = np.where(np.isnan(self._rotations[:, 0]), normals, rotated)
         return points, normals, displaced_palms

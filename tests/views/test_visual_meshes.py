@@ -13,9 +13,9 @@ import casadi_ik as ik
 from casadi_ik.app.drawing.drawables import collision_bodies, visual_bodies
 from casadi_ik.app.drawing.surfaces import decimate
 from casadi_ik.app.drawing.visual_meshes import (
-    MeshEntry,
     MeshTable,
     PackageEntry,
+    VisualMeshEntry,
     mesh_table,
     package_meshes,
 )
@@ -31,7 +31,9 @@ TABLE = MeshTable(
     {PACKAGE: PackageEntry("made_up_robots/data")},
     {
         "panda": [
-            MeshEntry(PACKAGE, "arm/arm.urdf", "MIT", {"panda_base": "base"}, JOINTS, ["cover"])
+            VisualMeshEntry(
+                PACKAGE, "arm/arm.urdf", "MIT", {"panda_base": "base"}, JOINTS, ["cover"]
+            )
         ]
     },
 )

@@ -70,7 +70,7 @@ class PackageEntry(Struct, frozen=True):
     clones: list[str] = []
 
 
-class MeshEntry(Struct, frozen=True):
+class VisualMeshEntry(Struct, frozen=True):
     """The description of a robot in a package.
 
     Attributes:
@@ -101,7 +101,7 @@ class MeshTable(Struct, frozen=True):
     """
 
     packages: dict[str, PackageEntry]
-    robots: dict[str, list[MeshEntry]]
+    robots: dict[str, list[VisualMeshEntry]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +205,7 @@ def package_meshes(description: RobotDescription, table: MeshTable) -> VisualMes
     return VisualMeshes(by_link, frozenset(covered), tuple(dict.fromkeys(origins)))
 
 
-def find_file(package: PackageEntry, entry: MeshEntry) -> Path | None:
+def find_file(package: PackageEntry, entry: VisualMeshEntry) -> Path | None:
     """Return the description of a robot in a package; None if it is not installed."""
     folders = [Path(clone).expanduser() for clone in package.clones]
     with suppress(metadata.PackageNotFoundError):
@@ -216,8 +216,8 @@ def find_file(package: PackageEntry, entry: MeshEntry) -> Path | None:
 
 
 def _candidates(
-    description: RobotDescription, entries: list[MeshEntry]
-) -> Iterator[tuple[MeshEntry, str]]:
+    description: RobotDescription, entries: list[VisualMeshEntry]
+) -> Iterator[tuple[VisualMeshEntry, str]]:
     """Return the entries whose joints the robot has, with the prefix of the robot's names."""
     for entry in entries:
         first = next(iter(entry.joints))
@@ -228,7 +228,7 @@ def _candidates(
                 yield entry, prefix
 
 
-def _covered_links(description: RobotDescription, entry: MeshEntry, prefix: str) -> set[str]:
+def _covered_links(description: RobotDescription, entry: VisualMeshEntry, prefix: str) -> set[str]:
     """Return the links of the robot that an entry draws."""
     names = {prefix + name for name in entry.joints}
     children = {joint.child for joint in description.movable if joint.name in names}
@@ -236,7 +236,7 @@ def _covered_links(description: RobotDescription, entry: MeshEntry, prefix: str)
 
 
 def _entry_meshes(
-    description: RobotDescription, entry: MeshEntry, prefix: str, path: Path
+    description: RobotDescription, entry: VisualMeshEntry, prefix: str, path: Path
 ) -> MeshesByLink:
     """Return the meshes of a description at the links of the robot; empty if they do not fit."""
     key = _cache_key(description, entry, prefix, path)
@@ -271,7 +271,7 @@ def _entry_meshes(
 def _compare(
     description: RobotDescription,
     tree: RobotTree,
-    entry: MeshEntry,
+    entry: VisualMeshEntry,
     prefix: str,
     links: Mapping[str, str],
 ) -> tuple[dict[str, Array], float]:
@@ -299,7 +299,7 @@ def _compare(
 
 
 def _carriers(
-    tree: RobotTree, entry: MeshEntry, links: Mapping[str, str]
+    tree: RobotTree, entry: VisualMeshEntry, links: Mapping[str, str]
 ) -> dict[str, tuple[str, Array]]:
     """Return the matched link that carries each link drawn, and its (4, 4) pose in that link."""
     poses, base = link_poses(tree.root, tree.joints, {}), next(iter(entry.base.values()))
@@ -330,7 +330,9 @@ def reduced_parts(parts: list[ColoredMesh]) -> tuple[ColoredMesh, ...]:
 # Cache. Reading and reducing the meshes of a robot takes seconds.
 
 
-def _cache_key(description: RobotDescription, entry: MeshEntry, prefix: str, path: Path) -> str:
+def _cache_key(
+    description: RobotDescription, entry: VisualMeshEntry, prefix: str, path: Path
+) -> str:
     """Return a hash of everything that the meshes of an entry depend on."""
     stamps = sorted(
         (str(file), file.stat().st_size, file.stat().st_mtime_ns)

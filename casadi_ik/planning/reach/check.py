@@ -84,36 +84,36 @@ class MapCheck:
     is_confirmed: Bools
 
 
-class Ball(NamedTuple):
+class BallArray(NamedTuple):
     """Numbers within a radius of a centre, elementwise."""
 
     center: Array
     radius: Array
 
-    def __add__(self, other: Ball) -> Ball:  # type: ignore[override]
+    def __add__(self, other: BallArray) -> BallArray:  # type: ignore[override]
         center = self.center + other.center
-        return Ball(center, _rounded_up(self.radius + other.radius, center))
+        return BallArray(center, _rounded_up(self.radius + other.radius, center))
 
-    def __sub__(self, other: Ball) -> Ball:
+    def __sub__(self, other: BallArray) -> BallArray:
         center = self.center - other.center
-        return Ball(center, _rounded_up(self.radius + other.radius, center))
+        return BallArray(center, _rounded_up(self.radius + other.radius, center))
 
-    def __matmul__(self, other: Ball) -> Ball:
+    def __matmul__(self, other: BallArray) -> BallArray:
         size, other_size = np.abs(self.center), np.abs(other.center)
         radius = size @ other.radius + self.radius @ (other_size + other.radius)
-        return Ball(self.center @ other.center, _rounded_up(radius, size @ other_size))
+        return BallArray(self.center @ other.center, _rounded_up(radius, size @ other_size))
 
-    def scale(self, factor: float) -> Ball:
+    def scale(self, factor: float) -> BallArray:
         """Return the numbers times an integer power of two."""
-        return Ball(self.center * factor, self.radius * abs(factor))
+        return BallArray(self.center * factor, self.radius * abs(factor))
 
-    def transpose(self) -> Ball:
+    def transpose(self) -> BallArray:
         """Return the transposed matrices."""
-        return Ball(self.center.swapaxes(-1, -2), self.radius.swapaxes(-1, -2))
+        return BallArray(self.center.swapaxes(-1, -2), self.radius.swapaxes(-1, -2))
 
-    def part(self, index: tuple[slice | int | None, ...]) -> Ball:
+    def part(self, index: tuple[slice | int | None, ...]) -> BallArray:
         """Return a part of each matrix."""
-        return Ball(self.center[(..., *index)], self.radius[(..., *index)])
+        return BallArray(self.center[(..., *index)], self.radius[(..., *index)])
 
 
 def _rounded_up(radius: Array, size: Array) -> Array:
@@ -121,30 +121,32 @@ def _rounded_up(radius: Array, size: Array) -> Array:
     return radius * (1 + RELATIVE_ROUNDING) + RELATIVE_ROUNDING * np.abs(size) + 1e-300
 
 
-def _dot(a: Ball, b: Ball) -> Ball:
+def _dot(a: BallArray, b: BallArray) -> BallArray:
     """Return scalar products (k,) of vectors (k, m, 1)."""
     return (a.transpose() @ b).part((0, 0))
 
 
-def _is_disjoint(a: Ball, b: Ball) -> Bools:
+def _is_disjoint(a: BallArray, b: BallArray) -> Bools:
     difference = a - b
     return np.abs(difference.center) > difference.radius
 
 
-class Frames(NamedTuple):
+class FrameBalls(NamedTuple):
     """Rotations (k, 3, 3) and origins (k, 3, 1) of frames."""
 
-    rotation: Ball
-    origin: Ball
+    rotation: BallArray
+    origin: BallArray
 
-    def compose(self, other: Frames) -> Frames:
+    def compose(self, other: FrameBalls) -> FrameBalls:
         """Return the frames `other`, given in these frames."""
-        return Frames(self.rotation @ other.rotation, self.rotation @ other.origin + self.origin)
+        return FrameBalls(
+            self.rotation @ other.rotation, self.rotation @ other.origin + self.origin
+        )
 
-    def inverse(self) -> Frames:
+    def inverse(self) -> FrameBalls:
         """Return the inverse transforms."""
         rotation = self.rotation.transpose()
-        return Frames(rotation, (rotation @ self.origin).scale(-1.0))
+        return FrameBalls(rotation, (rotation @ self.origin).scale(-1.0))
 
 
 class JointChain:
@@ -194,11 +196,11 @@ class JointChain:
             for first, second in pairwise(frames)
         ]
 
-    def palm(self, q: Array) -> Frames:
+    def palm(self, q: Array) -> FrameBalls:
         """Return the palm of configurations (k, n) [rad]."""
         pose = self.links[0]
         for i, link in enumerate(self.links[1:]):
-            turn = _turns(q[:, i], q[:, i])
+            turn = _rotations_about_z(q[:, i], q[:, i])
             pose = pose.compose(turn).compose(link)
         return pose
 
@@ -248,7 +250,7 @@ class JointChain:
             lower, upper, _ = self.contract(lower, upper, target)
         return True
 
-    def _best_division(self, lower: Array, upper: Array, target: Frames) -> int:
+    def _best_division(self, lower: Array, upper: Array, target: FrameBalls) -> int:
         """Return the joint whose division leaves the smallest volume of boxes."""
         n = len(self.lower)
         divided = [_divide(lower, upper, joint, CHECK_PARAMETERS.parts) for joint in range(n)]
@@ -264,7 +266,7 @@ class JointChain:
         width = ((upper - lower) / (self.upper - self.lower)).mean(axis=0)
         return int(np.lexsort((-width, np.round(np.log(volume + 1e-300), 1)))[0])
 
-    def contract(self, lower: Array, upper: Array, target: Frames) -> tuple[Array, Array, Rows]:
+    def contract(self, lower: Array, upper: Array, target: FrameBalls) -> tuple[Array, Array, Rows]:
         """Return the contracted boxes that are not refuted, and their row numbers."""
         rows = np.arange(len(lower))
         for _ in range(CHECK_PARAMETERS.passes):
@@ -275,14 +277,14 @@ class JointChain:
             lower, upper, rows = lower[~is_empty], upper[~is_empty], rows[~is_empty]
         return lower, upper, rows
 
-    def _compare_axes(self, lower: Array, upper: Array, target: Frames) -> Bools:
+    def _compare_axes(self, lower: Array, upper: Array, target: FrameBalls) -> Bools:
         """Contract boxes in place by all pairs of joints; return (k,) True where refuted."""
         n = len(self.lower)
-        turns = [_turns(lower[:, i], upper[:, i]) for i in range(n)]
+        rotations = [_rotations_about_z(lower[:, i], upper[:, i]) for i in range(n)]
         from_base, from_palm = [self.links[0]], [target.compose(self.links[-1].inverse())]
         for i in range(n - 1):
-            from_base.append(from_base[i].compose(turns[i]).compose(self.links[i + 1]))
-            back = turns[n - 1 - i].inverse().compose(self.links[n - 1 - i].inverse())
+            from_base.append(from_base[i].compose(rotations[i]).compose(self.links[i + 1]))
+            back = rotations[n - 1 - i].inverse().compose(self.links[n - 1 - i].inverse())
             from_palm.append(from_palm[i].compose(back))
         from_palm.reverse()
         is_refuted = np.zeros(len(lower), dtype=bool)
@@ -290,10 +292,10 @@ class JointChain:
             # Pose of joint j in the frame of joint i, its inverse, and the squared distance.
             between = pose_frames(np.eye(4), 0.0)
             inverse_origin = between.origin
-            squared = Ball(np.zeros(1), np.zeros(1))
+            squared = BallArray(np.zeros(1), np.zeros(1))
             for i in range(j, -1, -1):
                 if i < j:
-                    link, turn = self.links[i + 1], turns[i + 1]
+                    link, turn = self.links[i + 1], rotations[i + 1]
                     if i + 1 == j:
                         turn = pose_frames(np.eye(4), 0.0)
                     offset = link.rotation.transpose() @ link.origin
@@ -325,21 +327,23 @@ class JointChain:
                     _limit_angle(lower, upper, i, unit.part((slice(None), first)),
                                  relative.part((slice(None), first)))  # fmt: skip
                     continue
-                seen = between.rotation.part((slice(None), slice(2, 3)))
-                _limit_angle(lower, upper, i, seen, to_base @ axes[1])
+                axis = between.rotation.part((slice(None), slice(2, 3)))
+                _limit_angle(lower, upper, i, axis, to_base @ axes[1])
                 _limit_angle(lower, upper, i, between.origin, to_base @ distance)
-                seen = between.rotation.transpose().part((slice(None), slice(2, 3)))
-                _limit_angle(lower, upper, j, to_palm @ axes[0], seen)
+                axis = between.rotation.transpose().part((slice(None), slice(2, 3)))
+                _limit_angle(lower, upper, j, to_palm @ axes[0], axis)
                 _limit_angle(lower, upper, j, (to_palm @ distance).scale(-1.0), inverse_origin)
         return is_refuted
 
 
-def pose_frames(pose: Array, origin_radius: float, rotation_radius: float | None = None) -> Frames:
+def pose_frames(
+    pose: Array, origin_radius: float, rotation_radius: float | None = None
+) -> FrameBalls:
     """Return the frame of a pose (4, 4) with radii of its origin and rotation."""
     radius = origin_radius if rotation_radius is None else rotation_radius
-    return Frames(
-        Ball(pose[None, :3, :3], np.full((1, 3, 3), radius)),
-        Ball(pose[None, :3, 3:], np.full((1, 3, 1), origin_radius)),
+    return FrameBalls(
+        BallArray(pose[None, :3, :3], np.full((1, 3, 3), radius)),
+        BallArray(pose[None, :3, 3:], np.full((1, 3, 1), origin_radius)),
     )
 
 
@@ -363,7 +367,7 @@ def _axis_points(points: Array, axes: Array) -> Array:
     return result
 
 
-def _turns(lower: Array, upper: Array) -> Frames:
+def _rotations_about_z(lower: Array, upper: Array) -> FrameBalls:
     """Return rotations about z by angles in intervals [rad]."""
     cosine = _cosine(lower, upper)
     sine = _cosine(lower - np.pi / 2, upper - np.pi / 2)
@@ -376,24 +380,24 @@ def _turns(lower: Array, upper: Array) -> Frames:
         matrix[:, 1, 0], matrix[:, 0, 1] = s, sign * s
     center[:, 2, 2] = 1.0
     zero = np.zeros((1, 3, 1))
-    return Frames(Ball(center, radius), Ball(zero, zero))
+    return FrameBalls(BallArray(center, radius), BallArray(zero, zero))
 
 
-def _cosine(lower: Array, upper: Array) -> Ball:
+def _cosine(lower: Array, upper: Array) -> BallArray:
     """Return the cosines of angles in intervals of at most a few turns [rad]."""
-    ends = np.cos(lower), np.cos(upper)
-    low, high = np.minimum(*ends), np.maximum(*ends)
+    cosines = np.cos(lower), np.cos(upper)
+    low, high = np.minimum(*cosines), np.maximum(*cosines)
     for extreme, shift in ((1.0, 0.0), (-1.0, np.pi)):
-        turns = np.floor((upper - shift + 1e-9) / (2 * np.pi))
-        has_extreme = turns * (2 * np.pi) + shift >= lower - 1e-9
+        cycles = np.floor((upper - shift + 1e-9) / (2 * np.pi))
+        has_extreme = cycles * (2 * np.pi) + shift >= lower - 1e-9
         if extreme > 0:
             high = np.where(has_extreme, 1.0, high)
         else:
             low = np.where(has_extreme, -1.0, low)
-    return Ball((low + high) / 2, (high - low) / 2 + ELEMENTARY_ERROR)
+    return BallArray((low + high) / 2, (high - low) / 2 + ELEMENTARY_ERROR)
 
 
-def _limit_angle(lower: Array, upper: Array, joint: int, start: Ball, end: Ball) -> None:
+def _limit_angle(lower: Array, upper: Array, joint: int, start: BallArray, end: BallArray) -> None:
     """Intersect intervals of a joint with the angles about z from vectors to vectors, in place."""
     x, y = (start.part((slice(i, i + 1), slice(None))) for i in (0, 1))
     end_x, end_y = (end.part((slice(i, i + 1), slice(None))) for i in (0, 1))
