@@ -136,8 +136,13 @@ def own_robot(tmp_path: Path) -> Path:
     return copy_shipped_robot(tmp_path)
 
 
+LONGEST = "test_page_works_in_a_browser"
+"""Test of several minutes. It starts first, so that no process waits for it at the end."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests that draw where OpenGL is missing, except in CI."""
+    """Put the longest test first; skip tests that draw without OpenGL, except in CI."""
+    items.sort(key=lambda item: item.name != LONGEST)
     drawing = [item for item in items if item.get_closest_marker("opengl")]
     if drawing and "CI" not in os.environ and not _has_opengl():
         for item in drawing:
