@@ -286,7 +286,7 @@ def check_base(model: CollisionModel, scene: Scene, shapes: Array, names: Collec
     Args:
         model: Collision model of the robot.
         scene: The scene.
-        shapes: Poses of the shapes, from `shape_poses`.
+        shapes: (w,) or (1, w) poses of the shapes, from `shape_poses` of one configuration.
         names: Names of the obstacles to check.
 
     Raises:
@@ -298,7 +298,7 @@ def check_base(model: CollisionModel, scene: Scene, shapes: Array, names: Collec
         for i, link in enumerate(model.links):
             if not model.is_fixed(link) or frozenset((link, name)) in may_touch:
                 continue
-            segment = shapes[6 * i : 6 * i + 6].reshape(1, 1, 6)
+            segment = shapes.flat[6 * i : 6 * i + 6].reshape(1, 1, 6)
             depths = [
                 -float(from_solid(solid, segment, pose_row(obstacle.pose @ pose)[None])[0].item())
                 for solid, pose in obstacle.parts

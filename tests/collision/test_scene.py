@@ -90,3 +90,19 @@ def test_obstacles_at_the_base_are_refused(tmp_path):
         ik.Solver(robot, scene=ik.Scene(post_in_base))
     with pytest.raises(DescriptionError, match=r"touching.*'moon' is unknown"):
         ik.Solver(robot, scene=ik.Scene(SCENE, touching=[{"links": ["moon", "l1"], "reason": "x"}]))
+
+
+def test_a_scene_before_a_robot_with_one_motor():
+    """A configuration of one entry also has the shape of a batch of scalars."""
+    robot = ik.load_robot("robotiq_2f85")
+    points, normals = robot.contacts(q := np.array([0.4]))
+    contacts = [ik.Contact(*contact) for contact in zip(points, normals, strict=True)]
+    grasp = ik.Grasp(dict(zip(robot.fingers, contacts, strict=True)))
+    far = {"post": {"kind": "box", "size": [0.1, 0.1, 0.1], "xyz": [0, 0, 1.0]}}
+    solution = ik.Solver(robot, scene=ik.Scene(far)).solve(grasp)
+    assert solution.success
+    np.testing.assert_allclose(solution.q, q, atol=0.05)
+    at_pad = {"post": {"kind": "box", "size": [0.05, 0.05, 0.05], "xyz": points[0]}}
+    solution = ik.Solver(robot, scene=ik.Scene(at_pad)).solve(grasp)
+    assert not solution.success
+    assert solution.status is ik.Status.COLLISION
