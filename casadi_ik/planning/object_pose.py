@@ -15,9 +15,11 @@ import numpy as np
 from casadi_ik.files.arrays import Array, Counts, spread_points
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.pose import Free
 from casadi_ik.model.targets import TargetBatch
+from casadi_ik.solve.proofs.premises import required_points
 from casadi_ik.solve.proofs.proof import Proof, ProofKind
 from casadi_ik.solve.solution import BatchSolution, Solution
 from casadi_ik.solve.status import Status
@@ -77,17 +79,20 @@ def place_targets(targets: TargetBatch, poses: Array) -> TargetBatch:
     )
 
 
-def is_unreachable_throughout(prove: Prove, targets: TargetBatch, free: Free) -> bool:
+def is_unreachable_throughout(
+    prove: Prove, targets: TargetBatch, free: Free, robot: RobotDescription
+) -> bool:
     """Return True if a proof shows that no object pose within the bounds can be reached.
 
     Args:
         prove: Search for proofs.
         targets: One target, in the object frame.
         free: Bounds of the object pose.
+        robot: Description of the robot.
     """
     effort = POSE_PROOF_EFFORT
     lower, upper = np.array([free.lower]), np.array([free.upper])
-    levers = np.nan_to_num(np.linalg.norm(targets.points[0], axis=1))
+    levers = np.nan_to_num(np.linalg.norm(required_points(robot, targets)[0][0], axis=1))
     sizes = np.repeat([1.0, effort.radian_length + float(levers.max())], 3)
     count = 0
     while len(lower):
@@ -163,7 +168,9 @@ def solve_with_object(
     if solution.status is Status.UNREACHABLE and free.lower != free.upper and diagnosis is not None:
         # A contradiction within the hand does not depend on the pose of the contacts.
         is_of_hand = diagnosis.proof is not None and diagnosis.proof.kind is ProofKind.HAND
-        if not is_of_hand and not is_unreachable_throughout(prove, targets, free):
+        if not is_of_hand and not is_unreachable_throughout(
+            prove, targets, free, robot.description
+        ):
             diagnosis = replace(diagnosis, proof=None, searches=diagnosis.searches + len(poses))
             solution = replace(solution, status=Status.NOT_FOUND, diagnosis=diagnosis)
     return replace(solution, object_pose=center)

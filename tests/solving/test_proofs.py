@@ -106,6 +106,61 @@ def test_full_search_disproves_no_reachable_target(robot: ik.ArmHand, prover: Pr
     )
 
 
+def rolling_targets(robot: ik.ArmHand, q: Array, rng: np.random.Generator) -> TargetBatch:
+    """Return contacts that rolling pads reach at q (k, n), as far as the tolerance of 5 mm."""
+    frames = robot.frames_at(q)
+    _, balls = moved_targets((frames[..., :3, 3], frames[..., :3, 0]), rng, 0.0, 0.7)
+    radii = np.array([finger.radius for finger in robot.description.fingers])[:, None]
+    points = frames[..., :3, 3] + radii * (balls - frames[..., :3, 0])
+    points, _ = moved_targets((points, balls), rng, 0.99 * 5e-3, 0.0)
+    tolerance, free = ik.Tolerance(5e-3, np.deg2rad(3)), np.full_like(points, np.nan)
+    return TargetBatch(points, free, tolerance, True, extra_vectors={"balls": balls})
+
+
+@pytest.mark.parametrize("name", ["panda+allegro_right", "ur5e+leap", "shadow"])
+def test_proofs_hold_for_rolling_pads(name: str) -> None:
+    """Reachable contacts of rolling pads are not disproved, and contacts beyond reach are."""
+    robot, rng = ik.load_robot(name), np.random.default_rng(3)
+    q = robot.random(rng, 12)
+    q = q[robot.beyond_limits(q) <= 0]
+    prover, problems = Prover(robot.description), rolling_targets(robot, q, rng)
+    assert wrongly(robot, prover, q, problems) == 0
+    proofs = prover.prove(replace(problems.rows(slice(0, 3)), points=problems.points[:3] + 1.5))
+    assert all(proof is not None for proof in proofs)
+    assert proofs[0] is not None
+    assert proofs[0].check(robot)
+    # The same points with pads that need not roll are another target.
+    assert not proofs[0].check(robot, replace(proofs[0].target, extra_vectors={}))
+    sliding = {"planes": proofs[0].target.extra_vectors["balls"]}
+    target = replace(proofs[0].target, extra_vectors=sliding)
+    assert not replace(proofs[0], target=target).sealed().check(robot)
+
+
+@pytest.mark.parametrize(
+    ("name", "offset"),
+    [("panda+allegro_right", [1.5, 0.0, 0.0]), ("two_pandas+allegro", [0.0, 0.0, 5.0])],
+)
+def test_rolling_pads_beyond_reach_are_unreachable(name: str, offset: list[float]) -> None:
+    robot = ik.load_robot(name)
+    solver = ik.Solver(robot)
+    q = robot.home[None]
+    near = rolling_targets(robot, q, np.random.default_rng(4))
+    balls, points = near.extra_vectors["balls"], near.points + offset
+    batch = solver.solve_batch(points, near.normals, balls=balls, diagnose=True)
+    assert batch.status_names == ["UNREACHABLE"]
+    grasp = ik.Grasp(
+        {
+            finger: ik.Contact(points[0, i], ball=balls[0, i])
+            for i, finger in enumerate(robot.fingers)
+        }
+    )
+    solution = solver.solve(grasp)
+    assert solution.status is ik.Status.UNREACHABLE
+    assert solution.diagnosis is not None
+    assert solution.diagnosis.proof is not None
+    assert solution.diagnosis.proof.check(robot)
+
+
 def test_ignored_limits_and_tiny_tolerances_give_no_proof(robot: ik.ArmHand) -> None:
     rng = np.random.default_rng(4)
     q = rng.uniform(-np.pi, np.pi, (40, len(robot.actuators)))
@@ -288,6 +343,7 @@ def _bounds(prover: Prover) -> ca.Function:
     shapes = {"lower": (h, 1), "upper": (h, 1), "points": (3, 3), "normals": (3, 3)}
     shapes |= {"tolerance": (3, 2), "constrained": (3, 2)}
     p = {name: ca.SX.sym(name, *shape) for name, shape in shapes.items()}
+    p["depths"] = ca.SX(3, 1)
     ranges = prover.space.intervals(p["lower"], p["upper"])
     contacts = box_contacts(prover.space, ranges, (p["upper"] - p["lower"]) / 2, p, True)
     rows = [row for a, b in combinations(contacts, 2) for row in pair_rows(a, b)]
@@ -295,7 +351,7 @@ def _bounds(prover: Prover) -> ca.Function:
     min_distance, max_distance, _ = point_in_palm.distances(ca.SX(ca.DM(prover._arm.wrist)))
     outputs = [ca.vertcat(*(getattr(row, name) for row in rows)) for name in ("value", "width")]
     return ca.Function(
-        "bounds", list(p.values()), [*outputs, ca.vertcat(min_distance, max_distance)]
+        "bounds", [p[name] for name in shapes], [*outputs, ca.vertcat(min_distance, max_distance)]
     )
 
 

@@ -131,12 +131,12 @@ class BoxContact:
     u are the coordinates relative to the centre of the box, scaled by its half widths to [-1, 1].
 
     Attributes:
-        point: (3, 1) contact at the centre of the box [m]; palm frame, or base frame if the palm
-            is fixed.
+        point: (3, 1) point that must reach the target point, at the centre of the box [m]; palm
+            frame, or base frame if the palm is fixed.
         normal: (3, 1) unit normal, in the same frame.
         point_slopes: (3, h) derivatives of the point by u [m].
         normal_slopes: (3, h) derivatives of the normal by u.
-        target_point: (3, 1) target point [m], base frame.
+        target_point: (3, 1) point to reach (`premises.required_points`) [m], base frame.
         target_normal: (3, 1) target unit normal, base frame.
         has_point: 1 if the point is constrained, else 0.
         has_normal: 1 if the normal is constrained, else 0.
@@ -182,7 +182,7 @@ def box_contacts(
         space: Coordinates of the hand.
         intervals: Intervals of the finger joints, by name.
         half_widths: (h, 1) half widths of the box.
-        p: points, normals, tolerance and constrained, see `BoxTest.graph`.
+        p: points, depths, normals, tolerance and constrained, see `BoxTest.graph`.
         in_palm: True for contacts in the palm frame, False for a fixed palm.
     """
     robot = space.robot
@@ -193,7 +193,7 @@ def box_contacts(
     body = forward(robot, theta)
     contacts = []
     for i, finger in enumerate(robot.fingers):
-        names = "points", "normals", "tolerance", "constrained"
+        names = "points", "depths", "normals", "tolerance", "constrained"
         target_point = {name: p[name][i, :].T for name in names}
         contacts.append(
             _contact(space, body, finger, intervals, half_widths, target_point, in_palm)
@@ -212,6 +212,7 @@ def _contact(
 ) -> BoxContact:
     joints_by_name = {joint.name: joint for joint in space.robot.movable}
     point, normal = body.contact(finger.name)
+    point = point - p["depths"] * normal
     h = len(space.coordinates)
     point_slopes, normal_slopes = ca.SX.zeros(3, h), ca.SX.zeros(3, h)
     radius_shares, chord_shares = [ca.SX(0)] * h, [ca.SX(0)] * h

@@ -30,6 +30,7 @@ from casadi_ik.solve.proofs.premises import (
     joint_limits,
     motor_box,
     motor_limits,
+    required_points,
 )
 
 
@@ -38,10 +39,10 @@ class ContactBalls:
     """Bounds of the contacts of f fingers in k boxes.
 
     Attributes:
-        points: (k, f, 3) contact points at the centres of the boxes [m]; palm frame, or base frame
-            if the palm does not move.
+        points: (k, f, 3) points that must reach the target, at the centres of the boxes [m]; palm
+            frame, or base frame if the palm does not move.
         normals: (k, f, 3) unit normals, in the same frame.
-        radius: (k, f) largest distance of the contact from `points` [m].
+        radius: (k, f) largest distance of these points from `points` [m].
         angle: (k, f) largest angle of the contact normal to `normals` [rad].
         point_shares: (k, f, h) contribution of each motor to the radius [m].
         normal_shares: (k, f, h) contribution of each motor to the angle [rad].
@@ -81,6 +82,7 @@ def contact_balls(
     box: tuple[Array, Array],
     limits: tuple[Array, Array],
     fingers: Sequence[int],
+    depths: Sequence[float],
     in_palm: bool,
 ) -> ContactBalls:
     """Return bounds of the contacts in boxes of motor positions.
@@ -91,6 +93,7 @@ def contact_balls(
         box: Lower and upper bounds of the motors (k, h).
         limits: Lower and upper limits of the finger joints (m,).
         fingers: Indices of the fingers.
+        depths: Depths of the required points below the pads [m], see `required_points`.
         in_palm: True for contacts in the palm frame, False for the base frame.
     """
     count = len(box[0])
@@ -112,10 +115,11 @@ def contact_balls(
     points, normals, radius, angle, point_remainder, normal_remainder = [], [], [], [], [], []
     slopes_of_joints = np.zeros((2, count, len(fingers), len(joint_names), 3))
     shares = np.zeros((2, count, len(fingers), len(motors)))
-    for column, i in enumerate(fingers):
+    for column, (i, depth) in enumerate(zip(fingers, depths, strict=True)):
         finger = robot.fingers[i]
         pad = np.broadcast_to(poses[finger.link] @ finger.placement, (count, 4, 4))
-        point, normal = pad[:, :3, 3], pad[:, :3, :3] @ finger.normal
+        normal = pad[:, :3, :3] @ finger.normal
+        point = pad[:, :3, 3] - depth * normal
         displacement, rotation, remainder = np.zeros(count), np.zeros(count), np.zeros(count)
         inner_width = sum((intervals[name][1] for name in finger.joints), np.zeros(count))
         for name in reversed(finger.joints):
@@ -269,7 +273,9 @@ class Refutation:
         self.effort = CheckEffort()
         self.in_palm = any(j.type != "fixed" for j in robot.chain(robot.palm_link))
         self.limits = joint_limits(robot, target)
-        self.points, self.normals = target.points[0, fingers], target.normals[0, fingers]
+        points, depths = required_points(robot, target)
+        self.points, self.normals = points[0, fingers], target.normals[0, fingers]
+        self.depths = depths[0, fingers].tolist()
         self.position_margin = target.position_tolerance[fingers] + CHECK_MARGIN
         self.angle_margin = target.angle_tolerance[fingers] + CHECK_MARGIN
 
@@ -291,6 +297,7 @@ class Refutation:
                 (boxes[:, 0], boxes[:, 1]),
                 self.limits,
                 self.fingers,
+                self.depths,
                 self.in_palm,
             )
             refuted, scores = self._check(balls)

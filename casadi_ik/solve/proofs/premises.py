@@ -1,4 +1,4 @@
-"""Premises of proofs: ranges of motors, joints and the arm that a target allows.
+"""Premises of proofs: points that a target requires, and ranges of motors, joints and the arm.
 
 The prover and the checker share this module; each bounds the contacts with separate code.
 """
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arms.family import SphericalJoints
 from casadi_ik.kinematics.arms.recognise import srs_arm
+from casadi_ik.kinematics.contacts import CONDITIONS, POSITION
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import Joint, link_poses
 from casadi_ik.model.targets import TargetBatch
@@ -33,6 +34,37 @@ AXIS_TOLERANCE = 1e-9
 
 NO_CONE_LIMIT = -2.0
 """Cosine of a cone that excludes no direction."""
+
+
+SLIDING_ARRAYS = {
+    f"{name}s"
+    for condition in CONDITIONS.values()
+    if condition.aspect == POSITION
+    for name in condition.data
+} - {"points", "balls"}
+"""Arrays that let a contact slide away from its point; proofs ignore such fingers."""
+
+
+def required_points(robot: RobotDescription, targets: TargetBatch) -> tuple[Array, Array]:
+    """Return the points that the fingertips must reach, and their depths below the pads.
+
+    A contact of a rolling pad requires the centre of the pad's ball: the point at one radius behind
+    the contact point, opposite to the normal. All other contacts require the contact point itself.
+
+    Returns:
+        (k, f, 3) points [m], base frame, NaN where a finger is free or may slide; (k, f) depths
+        below the contact points of the fingertips [m].
+    """
+    points, depths = targets.points.copy(), np.zeros(targets.points.shape[:2])
+    for name, vectors in targets.extra_vectors.items():
+        is_present = ~np.isnan(vectors[..., 0])
+        if name in SLIDING_ARRAYS:
+            points[is_present] = np.nan
+        elif name == "balls":
+            radii = np.array([finger.radius for finger in robot.fingers])
+            depths = np.where(is_present, radii, 0.0)
+            points -= depths[..., None] * np.where(is_present[..., None], vectors, 0.0)
+    return points, depths
 
 
 def motor_limits(robot: RobotDescription, targets: TargetBatch) -> tuple[Array, Array]:

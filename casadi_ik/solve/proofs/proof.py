@@ -13,6 +13,7 @@ from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.proofs.check import Refutation
+from casadi_ik.solve.proofs.premises import required_points
 
 
 class ProofKind(StrEnum):
@@ -55,7 +56,8 @@ class Proof:
     def _seal(self) -> str:
         parts = (self.kind.name, self.fingers, self.boxes, self.tolerance)
         digest = hashlib.sha256(repr(parts).encode())
-        for array in (self.target.points, self.target.normals):
+        extra_vectors = (array for _, array in sorted(self.target.extra_vectors.items()))
+        for array in (self.target.points, self.target.normals, *extra_vectors):
             digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
         return digest.hexdigest()[:32]
 
@@ -102,7 +104,7 @@ def _is_confirmed(proof: Proof, robot: RobotDescription, target: TargetBatch | N
     numbers = [
         robot.finger_names.index(name) for name in proof.fingers if name in robot.finger_names
     ]
-    has_point = ~np.isnan(proved.points[0, :, 0])
+    has_point = ~np.isnan(required_points(robot, proved)[0][0, :, 0])
     if len(numbers) != len(proof.fingers) or not numbers or not has_point[numbers].all():
         return False
     pairs = zip(proof.tolerance, proved.tolerances, strict=True)
@@ -113,7 +115,8 @@ def _is_confirmed(proof: Proof, robot: RobotDescription, target: TargetBatch | N
 
 
 def _is_same_target(a: TargetBatch, b: TargetBatch) -> bool:
-    arrays = ((a.points, b.points), (a.normals, b.normals))
+    names = ("points", "normals", *sorted(a.extra_vectors.keys() | b.extra_vectors.keys()))
+    arrays = ((a.vectors(name), b.vectors(name)) for name in names)
     fixed = [np.zeros(0) if item.fixed is None else item.fixed for item in (a, b)]
     return (
         all(np.array_equal(array_a, array_b, equal_nan=True) for array_a, array_b in arrays)

@@ -19,7 +19,6 @@ import numpy as np
 from casadi_ik.compile import FunctionKernel
 from casadi_ik.compile.graphs import FunctionGraph, recipe
 from casadi_ik.files.arrays import Array, Bools, Counts, Rows
-from casadi_ik.kinematics.contacts import CONDITIONS, POSITION
 from casadi_ik.kinematics.smooth import Expr, with_cse
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.targets import TargetBatch
@@ -42,6 +41,7 @@ from casadi_ik.solve.proofs.premises import (
     fingers_without_limits,
     joint_limits,
     motor_box,
+    required_points,
 )
 from casadi_ik.solve.proofs.proof import Proof, ProofKind
 
@@ -64,18 +64,20 @@ class BoxTest:
         """Return the graph of the test.
 
         Returns:
-            ``(lower, upper, joint_lower, joint_upper, points, normals, tolerance, constrained,
-            span, cosines) -> (refuted, scores)``. Inputs: bounds of the coordinates (h,), limits of
-            the finger joints (m,), contacts (f, 3), tolerances of position and angle (f, 2),
-            1 where a point or normal is constrained (f, 2), smallest and largest distance of the
-            wrist from the shoulder (2,), cosines of the arm's cones (2,). Outputs: values > 0 if
-            the hand alone or the arm refutes the box (2,), and the contribution of each coordinate
-            to the remaining uncertainty (h,).
+            ``(lower, upper, joint_lower, joint_upper, points, depths, normals, tolerance,
+            constrained, span, cosines) -> (refuted, scores)``. Inputs: bounds of the coordinates
+            (h,), limits of the finger joints (m,), required points (f, 3) and their depths (f,),
+            normals (f, 3), tolerances of position and angle (f, 2), 1 where a point or normal is
+            constrained (f, 2), smallest and largest distance of the wrist from the shoulder (2,),
+            cosines of the arm's cones (2,). Outputs: values > 0 if the hand alone or the arm
+            refutes the box (2,), and the contribution of each coordinate to the remaining
+            uncertainty (h,).
         """
         robot = self.space.robot
         h, m, f = len(robot.finger_motors), len(robot.finger_joints), len(robot.fingers)
         shapes = {"lower": (h, 1), "upper": (h, 1), "joint_lower": (m, 1), "joint_upper": (m, 1)}
-        shapes |= {"points": (f, 3), "normals": (f, 3), "tolerance": (f, 2), "constrained": (f, 2)}
+        shapes |= {"points": (f, 3), "depths": (f, 1), "normals": (f, 3)}
+        shapes |= {"tolerance": (f, 2), "constrained": (f, 2)}
         shapes |= {"span": (2, 1), "cosines": (2, 1)}
         name = ca.Function.fix_name(f"{robot.name}_box_test")
 
@@ -188,15 +190,6 @@ class ProverEffort:
 
 PROVER_EFFORT = ProverEffort()
 
-SLIDING_ARRAYS = {
-    f"{name}s"
-    for condition in CONDITIONS.values()
-    if condition.aspect == POSITION
-    for name in condition.data
-    if name != "point"
-}
-"""Arrays that let a contact slide away from its point; proofs ignore such fingers."""
-
 Boxes = tuple[Rows, Array, Array]
 """Boxes of one chunk: target index (k,), lower and upper bounds (k, h)."""
 
@@ -267,10 +260,7 @@ class Prover:
     def _prove_pass(
         self, targets: TargetBatch, known_hands: Array | None, box_limits: Counts
     ) -> list[Proof | None]:
-        is_usable = ~np.isnan(targets.points[:, :, 0])
-        for name in SLIDING_ARRAYS & targets.extra_vectors.keys():
-            # A contact on a line or a plane need not reach the point itself.
-            is_usable &= np.isnan(targets.extra_vectors[name][..., 0])
+        is_usable = ~np.isnan(required_points(self._robot, targets)[0][:, :, 0])
         is_usable &= ~np.array(fingers_without_limits(self._robot, motor_box(self._robot, targets)))
         proofs: list[Proof | None] = [None] * len(targets)
         for group, max_boxes in self._finger_groups():
@@ -359,7 +349,8 @@ class Prover:
             known_hands: (k, h) hands that reach the targets, see `prove`.
         """
         count = len(targets)
-        points = np.where(fingers[..., None], targets.points, 0.0)
+        points, depths = required_points(self._robot, targets)
+        points = np.where(fingers[..., None], points, 0.0)
         has_normal = fingers & ~np.isnan(targets.normals[:, :, 0])
         normals = np.where(has_normal[..., None], targets.normals, 0.0)
         constrained = np.stack([fingers, has_normal], axis=2).astype(float)
@@ -369,7 +360,8 @@ class Prover:
         )
         # Kernels drop the second dimension of columns, so that a hand with one motor needs a
         # reshape.
-        size, limit_shape = self._test.input_shapes[0], self._test.input_shapes[2]
+        size, limit_shape, depth_shape = (self._test.input_shapes[i] for i in (0, 2, 5))
+        depths = depths.reshape(count, *depth_shape)
         limits = [np.reshape(end, limit_shape) for end in joint_limits(self._robot, targets)]
         arm_inputs = np.zeros(2), np.full(2, NO_CONE_LIMIT)
         if self._arm is not None:
@@ -386,7 +378,7 @@ class Prover:
             boxes += np.bincount(target, minlength=count)
             refuted, scores = self._test(
                 *(end.reshape(len(end), *size) for end in (lower, upper)),
-                *(*limits, points[target], normals[target]),
+                *(*limits, points[target], depths[target], normals[target]),
                 *(tolerance, constrained[target], *arm_inputs),
             )
             refuted, scores = refuted > 0, scores.reshape(lower.shape)
