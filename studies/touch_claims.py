@@ -362,13 +362,32 @@ def link_depth(robot: ik.ArmHand, mesh: Any, back: np.ndarray, grasp: Any) -> fl
     is_near = outside < radius
     if not is_near.any():
         return 0.0
-    foot = feet(mesh, points[is_near])
-    behind = (
-        (points[is_near] - foot.point)
-        * np.array([normals_of_contact[0] for normals_of_contact in foot.normals])
-    ).sum(1)
-    signed = np.copysign(foot.distance, behind)
-    return float(max(0.0, (radius[is_near] - signed).max()))
+    return float(max(0.0, (radius[is_near] - signed_distances(mesh, points[is_near])).max()))
+
+
+def signed_distances(mesh: Any, points: np.ndarray) -> np.ndarray:
+    """Return the distances (k,) of points (k, 3) from the surface of a mesh [m], negative inside.
+
+    The winding number decides the sign. The normal of the nearest triangle does not, because at an
+    edge several triangles are equally near and their normals disagree.
+    """
+    is_inside = winding_numbers(mesh, points) > 0.5
+    return np.where(is_inside, -1.0, 1.0) * feet(mesh, points).distance
+
+
+def winding_numbers(mesh: Any, points: np.ndarray) -> np.ndarray:
+    """Return how often a closed mesh encloses each point (k, 3): about 0 outside, at least 1 inside.
+
+    The signed solid angles of all triangles are summed (van Oosterom and Strackee 1983).
+    """
+    winding = np.zeros(len(points))
+    for i, point in enumerate(points):
+        a, b, c = np.moveaxis(mesh.triangles - point, 1, 0)
+        la, lb, lc = (np.linalg.norm(corner, axis=1) for corner in (a, b, c))
+        volume = (a * np.cross(b, c)).sum(axis=1)
+        products = (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
+        winding[i] = np.arctan2(volume, la * lb * lc + products).sum() / (2 * np.pi)
+    return winding
 
 
 def cells(options: argparse.Namespace) -> list[Cell]:

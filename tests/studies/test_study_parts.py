@@ -132,6 +132,18 @@ def test_check_detects_another_mesh():
     assert violations["outside the cone"]
 
 
+def test_depths_are_right_beside_concave_and_sharp_edges(rng):
+    _, bar = touch_claims.surface_of("angle_bar")
+    edges = bar.vertices[bar.edges_unique].mean(axis=1)
+    points = (edges[:, None] + rng.normal(scale=4e-3, size=(len(edges), 30, 3))).reshape(-1, 3)
+    x, y, z = points.T
+    in_foot = (x > 0) & (x < 0.08) & (y > 0) & (y < 0.015)
+    in_wedge = (x > 0) & (y >= 0.015) & (x < 0.015 * (0.08 - y) / 0.065)
+    is_inside = (in_foot | in_wedge) & (abs(z) < 0.03)
+    assert 100 < is_inside.sum() < len(points) - 100
+    np.testing.assert_array_equal(touch_claims.signed_distances(bar, points) < 0, is_inside)
+
+
 def test_weak_squeeze_drops_the_object(monkeypatch):
     solver, surface = ik.Solver(ik.load_robot("panda+panda_hand")), ik.load_surface("tennis_ball")
     (grasp,) = solver.grasps_of(surface, standing(surface, 0.7), limit=1, among=1)
