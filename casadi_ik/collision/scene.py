@@ -16,8 +16,8 @@ from casadi_ik.collision.scene_file import ObjectEntry, SceneFile, SolidEntry
 from casadi_ik.collision.solids import Kind, PosedSolid, object_solids
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import warn_of_obstacle
-from casadi_ik.files.input_checks.poses import checked_pose
+from casadi_ik.files.input_checks.numbers import checked_mapping, warn_of_obstacle
+from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.files.reading import read, validated
 from casadi_ik.files.shipped import resolve_description
 from casadi_ik.model.link_shapes import Touching
@@ -89,10 +89,13 @@ class Scene:
         Raises:
             DescriptionError: A value is invalid; the message names its key.
         """
+        solids = checked_mapping({} if solids is None else solids, "solids", "from names to solids")
+        if not isinstance(name, str):
+            raise InputError(f"name: found {name!r}, expected text")
         # Large arrays of points, which may contain NaN, bypass the validation of nested lists.
         clouds = {
             key: value["points"]
-            for key, value in (solids or {}).items()
+            for key, value in solids.items()
             if isinstance(value, Mapping)
             and value.get("kind") == "point-cloud"
             and isinstance(value.get("points"), np.ndarray)
@@ -100,7 +103,7 @@ class Scene:
         data = {
             "solids": {
                 key: _with_lists({**value, "points": []} if key in clouds else value)
-                for key, value in (solids or {}).items()
+                for key, value in solids.items()
             },
             "margin": margin,
             "grasped": grasped,
@@ -164,7 +167,7 @@ class Scene:
                 f"scene {self.name!r} has no obstacle {name!r}; "
                 f"expected one of: {_name_list(self.items)}"
             )
-        pose = checked_pose(pose, f"pose of {name!r}")
+        pose = single_pose(pose, f"pose of {name!r}")
         return self._with_obstacle(replace(self.items[name], pose=pose))
 
     def holding(self, name: str, pose: ArrayLike) -> Scene:
@@ -184,7 +187,7 @@ class Scene:
             >>> scene.grasped
             'cup'
         """
-        pose = checked_pose(pose, f"pose of {name!r}")
+        pose = single_pose(pose, f"pose of {name!r}")
         if name in self.items:
             obstacle = replace(self.items[name], pose=pose)
         else:

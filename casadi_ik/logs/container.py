@@ -69,7 +69,7 @@ message is a section of its own. Reading sections thus takes about as much memor
 
 
 class ForeignLogError(LogError):
-    """An MCAP file of another program, such as a ROS bag."""
+    """A file of another program, such as a ROS bag."""
 
 
 class NothingWrittenError(LogError):
@@ -217,12 +217,12 @@ def check_magic(stream: IO[bytes]) -> tuple[int, bool]:
 
     Raises:
         NothingWrittenError: The file is empty or ends within the magic bytes.
-        LogError: The file is not an MCAP file.
+        ForeignLogError: The file is not an MCAP file.
     """
     stream.seek(0)
     start = stream.read(len(MAGIC))
     if start != MAGIC:
-        error_type = NothingWrittenError if MAGIC.startswith(start) else LogError
+        error_type = NothingWrittenError if MAGIC.startswith(start) else ForeignLogError
         problem = f"it starts with {start!r}" if start else "it is empty"
         raise error_type(f"not an MCAP file: {problem}")
     size = stream.seek(0, os.SEEK_END)

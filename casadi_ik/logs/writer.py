@@ -337,8 +337,11 @@ def recorder_of(
 
     Raises:
         LogError: The log cannot be written.
+        InputError: The argument is neither a path nor a recorder.
     """
     if not isinstance(log, str | os.PathLike):
+        if log is not None and not hasattr(log, "record"):
+            raise InputError(f"log: found {log!r}, expected a path, a recorder, or None")
         return contextlib.nullcontext(log)
     return McapRecorder(
         log,

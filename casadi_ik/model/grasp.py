@@ -13,10 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools, read_only
-from casadi_ik.files.input_checks.numbers import warn_of_wide_tolerance
+from casadi_ik.files.input_checks.numbers import checked_mapping, warn_of_wide_tolerance
 from casadi_ik.files.input_checks.poses import MAX_SKEW, single_pose
 from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.model.pose import Free, inverse
+
+MIN_TOLERANCE = 1e-15
+"""Smallest tolerance [m or rad]: errors of configurations are rounded to about 1e-16."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,7 @@ class Tolerance:
         angle: Angle of the pad normal [rad].
 
     Raises:
-        InputError: A value is not a positive finite number.
+        InputError: A value is not a finite number of at least `MIN_TOLERANCE`.
 
     Example:
         >>> ik.Tolerance(position=1e-3, angle=np.deg2rad(1)).position
@@ -40,8 +43,12 @@ class Tolerance:
 
     def __post_init__(self) -> None:
         for name, value in (("position", self.position), ("angle", self.angle)):
-            if not (isinstance(value, (int, float)) and math.isfinite(value) and value > 0):
-                raise InputError(f"tolerance.{name}: found {value!r}, expected a number > 0")
+            is_number = isinstance(value, (int, float)) and math.isfinite(value)
+            if not (is_number and value >= MIN_TOLERANCE):
+                expected = (
+                    f"a number >= {MIN_TOLERANCE:g}" if is_number and value > 0 else "a number > 0"
+                )
+                raise InputError(f"tolerance.{name}: found {value!r}, expected {expected}")
 
 
 UNIT_ROUNDING = 1e-15
@@ -343,6 +350,8 @@ class Grasp:
     squeeze: Grasp | None = None
 
     def __post_init__(self) -> None:
+        checked_mapping(self.contacts, "contacts", "from fingers to contacts")
+        checked_mapping(self.posture, "posture", "from motors to positions")
         if self.palm is not None:
             object.__setattr__(self, "palm", _frozen_palms(self.palm))
             if self.contacts:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.numbers import checked_mapping
 from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import (
@@ -247,7 +248,7 @@ def fixed_array(
     if not fixed:
         return None
     values = np.full(len(actuators), np.nan)
-    for name, value in fixed.items():
+    for name, value in checked_mapping(fixed, "fixed", "from actuators to positions").items():
         if name not in actuators:
             raise UnknownNameError(
                 f"fixed: unknown actuator {name!r}; expected one of {', '.join(actuators)}"

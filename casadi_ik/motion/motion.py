@@ -27,6 +27,10 @@ RUN_UP = 0.25
 """Time from rest to the velocity limit of a motor without an acceleration limit [s]."""
 
 
+MAX_RATE = 1e12
+"""Largest limit of a velocity or an acceleration; with larger ones durations underflow."""
+
+
 @dataclass(frozen=True, eq=False)
 class Rates:
     """Limits of the motors' motion.
@@ -126,8 +130,9 @@ def finite_array(
 def positive_per_motor(robot: ArmHand, name: str, value: Any) -> Array:
     """Return one positive number per motor, see `finite_array`."""
     n = len(robot.actuators)
-    shape, expected = () if np.ndim(value) == 0 else (n,), f"a number > 0, or {n} of them"
-    array = finite_array(name, value, shape, lambda array: array > 0, expected)
+    shape = () if np.ndim(value) == 0 else (n,)
+    expected = f"a number > 0 and <= {MAX_RATE:g}, or {n} of them"
+    array = finite_array(name, value, shape, lambda x: (x > 0) & (x <= MAX_RATE), expected)
     return np.array(np.broadcast_to(array, (n,)))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks.numbers import checked_integer
 from casadi_ik.files.input_checks.poses import single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import group_by_kinds
@@ -140,6 +141,9 @@ class MovingSolver:
             >>> track.q.shape, bool(track.success.all()), track.jumps
             ((3, 14), True, ())
         """
+        if isinstance(grasps, str) or not isinstance(grasps, Iterable):
+            raise InputError(f"grasps: found {type(grasps).__name__}, expected a list of grasps")
+        grasps = list(grasps)
         if not grasps:
             raise InputError("grasps: found 0 grasps, expected at least one")
         if period is None and velocity is not None:
@@ -225,7 +229,12 @@ class MovingSolver:
             raise UnsupportedError(f"lift: {self.robot.name!r} has no arm that moves its palm")
         pace = self._pace(velocity, acceleration, period)
         approach_plan = self._approach_plan(grasp, start, opening, distance, direction)
-        plan = ReachPlan(approach_plan, pace, seed, np.clip(start, *approach_plan.plan.bounds))
+        plan = ReachPlan(
+            approach_plan,
+            pace,
+            checked_integer(seed, "seed", 0),
+            np.clip(start, *approach_plan.plan.bounds),
+        )
         solutions = self._solutions(grasp, approach_plan.problem, start, seed, limit)
         return reach(plan, *solutions, *lengths)
 
@@ -308,7 +317,12 @@ class MovingSolver:
             held_target = self._target_builder.from_grasps([grasp])
             carried_object = CarriedObject(self._engine.check, held_target, q)
         pace, height = self._pace(velocity, acceleration, period), length("lower", lower)
-        plan = ReachPlan(approach_plan, pace, seed, np.clip(start, *approach_plan.plan.bounds))
+        plan = ReachPlan(
+            approach_plan,
+            pace,
+            checked_integer(seed, "seed", 0),
+            np.clip(start, *approach_plan.plan.bounds),
+        )
         problem = self._target_builder.from_grasps([palm])
         solutions = self._solutions(palm, problem, start, seed, limit)
         return place(plan, *solutions, carried_object, height)
@@ -364,7 +378,7 @@ class MovingSolver:
             query = check.collision_query(self._placeholder_target(np.nan)).rows(
                 np.zeros(1, dtype=np.intp)
             )
-        return move(self.robot, endpoints, query, pace, seed)
+        return move(self.robot, endpoints, query, pace, checked_integer(seed, "seed", 0))
 
     def approach(
         self,
@@ -445,7 +459,10 @@ class MovingSolver:
                 return [q], ""
             error = f"{1e3 * np.nanmax(verdict.position_error):.3g} mm"
             return [], f"q of the chosen grasp is not a solution (error {error}, or limits)"
-        engine, problem = self._engine.engine_for(problem), replace(problem, q0=start, seed=seed)
+        engine, problem = (
+            self._engine.engine_for(problem),
+            replace(problem, q0=start, seed=checked_integer(seed, "seed", 0)),
+        )
         alternatives = engine.finder.find(
             problem, limit, "q0", separation=0.05, query=engine.collision_query(problem)
         )

@@ -58,7 +58,8 @@ def stack_postures(
     columns = [robot.actuators.index(motor) for motor in motors]
     q = np.full((len(postures), len(robot.actuators)), np.nan)
     try:
-        values = np.array([[posture[motor] for motor in motors] for posture in postures], float)
+        rows = [[posture[motor] for motor in motors] for posture in postures]
+        values = np.array(rows, float).reshape(len(postures), len(motors))
     except (KeyError, TypeError, ValueError):
         values = np.full((len(postures), len(motors)), np.nan)
     low, high = robot.lower[columns], robot.upper[columns]

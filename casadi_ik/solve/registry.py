@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 
 from casadi_ik.errors import InputError, UnknownNameError
+from casadi_ik.files.input_checks.numbers import checked_mapping
 from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.hand_first.method import HandFirstMethod
@@ -169,6 +170,7 @@ def with_finger_step(
         UnknownNameError: The method does not exist.
         InputError: The options contain a finger step already.
     """
+    checked_mapping(options, "options", "from names to values")
     if finger_step is None:
         return dict(options)
     if "finger_step" in options:

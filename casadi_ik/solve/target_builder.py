@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import warn_of_far_contacts, warn_of_wide_tolerance
+from casadi_ik.files.input_checks.numbers import check_contact_distances, warn_of_wide_tolerance
 from casadi_ik.files.input_checks.poses import checked_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH
@@ -92,7 +92,7 @@ def _palm_is_free(points: Array, directions: Array) -> NDArray[np.bool_]:
     for i, axis in enumerate(np.eye(3)):
         jacobian[:, i, :f] = axis * has_point
         jacobian[:, 3 + i] = vectors @ CROSS_PRODUCTS[i]
-    rows = jacobian.reshape(len(points), 6, -1)
+    rows = jacobian.reshape(len(points), 6, 3 * jacobian.shape[2])
     smallest = np.linalg.eigvalsh(rows @ np.swapaxes(rows, 1, 2))[:, 0]
     return np.asarray(smallest < MIN_CONTACT_MOTION**2)
 
@@ -168,7 +168,7 @@ class TargetBuilder:
         vectors = dict(extra_vectors or {})
         directions = vectors.pop(DIRECTIONS_KEY, None)
         p, n = target_arrays(points, normals, len(self.robot.fingers), first_row, directions)
-        warn_of_far_contacts(p, "points", self._base_travel)
+        check_contact_distances(p, "points", self._base_travel)
         return TargetBatch(
             p,
             n,
@@ -350,7 +350,7 @@ class TargetBuilder:
             if len(arrays) == 1
             else (np.array(vectors) for vectors in zip(*arrays, strict=True))
         )
-        warn_of_far_contacts(points, grasps[0].name or "contacts", self._base_travel)
+        check_contact_distances(points, grasps[0].name or "contacts", self._base_travel)
         return points, normals, _stack_vectors(vectors, len(fingers)) if any(vectors) else {}
 
     def _tolerances_of(self, grasp: Grasp) -> tuple[Tolerance, ...]:

@@ -180,6 +180,7 @@ def test_a_folder_with_logs_of_other_objects_and_a_bag(
     write(make_block(7, form=TraceFormat(LAYOUT, names)), name="study/cup.mcap")
     write(make_block(8, form=TraceFormat(lean, LABELS)), name="study/mug.mcap")
     write_bag(folder / "bags" / "ride.mcap")
+    (folder / "._apple.mcap").write_bytes(b"\0\x05\x16\x07\0\x02")  # of macOS, on foreign disks
     log = logs.open(folder)
     assert len(log.solves()) == 4
     assert sorted(log.solves().frame()["iterations"].to_list()) == [5, 6, 7, 8]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import operator
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +42,22 @@ def checked_number(
     if not math.isfinite(number):
         raise InputError(f"{location}: found {value!r}, expected {expected}")
     return number
+
+
+def checked_mapping(value: Any, location: str, expected: str) -> Mapping[Any, Any]:
+    """Return an argument that is a mapping.
+
+    Args:
+        value: The argument.
+        location: Name of the argument, for the message.
+        expected: Keys and values of the mapping, for the message.
+
+    Raises:
+        InputError: The argument is not a mapping.
+    """
+    if not isinstance(value, Mapping):
+        raise InputError(f"{location}: found {type(value).__name__}, expected a mapping {expected}")
+    return value
 
 
 def checked_integer(value: Any, location: str, minimum: int) -> int:
@@ -152,6 +169,9 @@ class UsualSizes:
 
 USUAL_SIZES = UsualSizes()
 
+MAX_COORDINATE = 1e9
+"""Largest coordinate of a contact [m]: squared errors do not overflow in single precision."""
+
 ROUNDING_MARGIN = 1e-9
 """Relative excess that causes no warning, such as the rounding of 30 deg in radians [-]."""
 
@@ -160,18 +180,27 @@ def _warn(message: str) -> None:
     warnings.warn(message, InputWarning, stacklevel=3)
 
 
-def warn_of_far_contacts(points: Array, location: str, base_travel: float = 0.0) -> None:
-    """Warn of contact points (..., 3) that are more than `UsualSizes.contact` from the base.
+def check_contact_distances(points: Array, location: str, base_travel: float = 0.0) -> None:
+    """Warn of contact points (..., 3) more than `UsualSizes.contact` from the base.
 
     Args:
         points: Contact points [m]; NaN where free.
         location: Name of the argument, or file and key.
         base_travel: Distance that a mobile base travels [m].
+
+    Raises:
+        InputError: A coordinate is larger than `MAX_COORDINATE`.
     """
     max_distance = USUAL_SIZES.contact + base_travel
     is_beyond = np.abs(points) > max_distance  # the test of a box is cheaper than lengths
     if not is_beyond.any():
         return
+    largest = float(np.abs(points[is_beyond]).max())
+    if largest > MAX_COORDINATE:
+        raise InputError(
+            f"{location}: found a coordinate of {largest:.4g} m; expected at most "
+            f"{MAX_COORDINATE:g} m"
+        )
     distance = float(np.linalg.norm(points[is_beyond.any(axis=-1)][0]))
     _warn(
         f"{location}: a contact is {distance:.4g} m from the robot's base; expected at most "

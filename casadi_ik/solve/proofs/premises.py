@@ -272,6 +272,8 @@ def palms_in_span(arm: ArmSpan | None, targets: TargetBatch) -> NDArray[np.bool_
     """
     if arm is None or targets.palms is None:
         return None
+    if not len(targets):
+        return np.zeros(0, dtype=bool)
     fixed = targets.fixed
     first_target = targets if fixed is None or fixed.ndim == 1 else replace(targets, fixed=fixed[0])
     nearest, farthest = arm.span(first_target)
