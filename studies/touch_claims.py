@@ -376,7 +376,7 @@ def signed_distances(mesh: Any, points: np.ndarray) -> np.ndarray:
 
 
 def winding_numbers(mesh: Any, points: np.ndarray) -> np.ndarray:
-    """Return how often a closed mesh encloses each point (k, 3): about 0 outside, at least 1 inside.
+    """Return how often a closed mesh encloses each of the points (k, 3), about 0 outside it.
 
     The signed solid angles of all triangles are summed (van Oosterom and Strackee 1983).
     """
