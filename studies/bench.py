@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from bench_parts import ABROAD, CASES
@@ -36,6 +36,9 @@ from casadi_ik.errors import InputError
 
 ROBOTS = ("kuka_lwr_barrett", "panda+allegro_right", "ur5e+shadow", "xarm6+leap")
 USUAL = ("batch", "fast", "single", "scene", "follow")
+
+OLDEST = "e4d962a7"
+"""Oldest revision of the package that the benchmark was run against."""
 
 INTRODUCTION = """
 Least of {turns} turns; processor time of the measured thread, verdicts included, unless the row
@@ -68,11 +71,16 @@ class Worker:
         """Measure a case once; return quantities by name, None if it is not possible."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(case) + "\n")
-        self._process.stdin.flush()
-        line = self._process.stdout.readline()
+        line = ""
+        with suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(case) + "\n")
+            self._process.stdin.flush()
+            line = self._process.stdout.readline()
         if not line:
-            raise InputError(f"{self.package}: the measurement of {' '.join(map(str, case))} died")
+            raise InputError(
+                f"{self.package}: the process that measures {' '.join(map(str, case))} ended; "
+                f"expected a package with the public names of revision {OLDEST} or later"
+            )
         answer = json.loads(line)
         if "error" in answer:
             Console(stderr=True).print(
@@ -82,7 +90,8 @@ class Worker:
 
     def stop(self) -> None:
         """End the process."""
-        self._process.communicate("")
+        with suppress(BrokenPipeError):
+            self._process.communicate("")
 
 
 @contextmanager

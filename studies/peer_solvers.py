@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from peer_robots import Joints, peer_urdf
+from samplers import Array
 
 import casadi_ik as ik
-from casadi_ik.files.arrays import Array
 
 LENGTH = 0.1
 """Position errors are divided by this [m], so that they weigh like those of the normals."""

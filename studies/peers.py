@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from peer_solvers import Mink, Peer, Pink, Placo, Scipy
+from samplers import Array
 
 import casadi_ik as ik
-from casadi_ik.files.arrays import Array
 
 Targets = tuple[Array, Array]
 

@@ -10,9 +10,11 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 import casadi_ik as ik
-from casadi_ik.files.arrays import Array
+
+Array = NDArray[np.float64]
 
 Sampler = Callable[[ik.ArmHand, np.random.Generator, int], Array]
 

@@ -13,6 +13,7 @@ import peers
 import pytest
 
 import casadi_ik as ik
+from casadi_ik.errors import InputError
 
 ROOT = Path(ik.__file__).parents[1]
 CASES = (
@@ -47,6 +48,18 @@ def test_two_checkouts_alternate(tmp_path):
     assert all(float(cell) > 0 for row in rows for cell in row.split(" | "))
     assert "--against CHECKOUT" in text
     assert str(ROOT) not in text
+
+
+def test_another_checkout_needs_the_public_names_alone(tmp_path):
+    modules = "bench_parts", "bench_processes", "bench_solves", "samplers", "peers", "peer_solvers"
+    for name in modules:
+        text = (ROOT / "studies" / f"{name}.py").read_text()
+        assert not re.findall(r"^(?:from|import) casadi_ik\.(?!errors)", text, re.MULTILINE), name
+    package = tmp_path / "casadi_ik"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    with pytest.raises(InputError, match=bench.OLDEST):
+        bench.main(["--part", "fast", "--robots", "ar10", "--against", str(tmp_path)])
 
 
 def test_rows_above_a_ratio_are_reported():
