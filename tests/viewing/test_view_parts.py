@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.app.drawing.drawables import item_drawables, visual_bodies
+from casadi_ik.app.drawing import MESHES_VARIABLE
+from casadi_ik.app.drawing.drawables import collision_bodies, item_drawables, visual_bodies
 from casadi_ik.app.drawing.surfaces import arrow, split_sharp_edges
 from casadi_ik.app.viewer import request_of
 from casadi_ik.app.viewer.camera import cameras
@@ -205,3 +206,15 @@ def test_links_look_like_their_files(description: Path) -> None:
     for link in ("first_2", "second_2"):
         assert np.allclose(np.ptp(surfaces[link].points, axis=0), [0.02, 0.016, 0.04])
         assert np.allclose(surfaces[link].points.mean(axis=0), [0, 0, 0.02])
+
+
+def test_visual_meshes_can_be_disabled(description: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = ik.load_robot(description)
+    monkeypatch.setenv(MESHES_VARIABLE, "off")
+    shapes = {body.frame: body.surface for body in collision_bodies(robot)}
+    for body in visual_bodies(robot):
+        if body.role != "pad" and body.frame in shapes:
+            assert np.allclose(body.surface.points, shapes[body.frame].points)
+    monkeypatch.delenv(MESHES_VARIABLE)
+    surfaces = {body.name: body.surface for body in visual_bodies(robot)}
+    assert np.allclose(np.ptp(surfaces["first_2"].points, axis=0), [0.02, 0.016, 0.04])

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from msgspec import structs
 
 import casadi_ik as ik
+from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import collision_bodies, visual_bodies
-from casadi_ik.app.drawing.surfaces import decimate
-from casadi_ik.app.drawing.visual_meshes import (
+from casadi_ik.app.drawing.mesh_table import (
+    MeshFileEntry,
     MeshTable,
     PackageEntry,
     VisualMeshEntry,
+    fetch_repository,
     mesh_table,
-    package_meshes,
 )
+from casadi_ik.app.drawing.surfaces import decimate
+from casadi_ik.app.drawing.visual_meshes import package_meshes
+from casadi_ik.files.arrays import Array
 from casadi_ik.files.number_files import read_mesh_parts
-from casadi_ik.files.reading import roll_pitch_yaw
+from casadi_ik.files.reading import Frame, frame_matrix, roll_pitch_yaw
 from casadi_ik.files.shipped import shipped_names
 from casadi_ik.integrations.importing.meshes import IndexedMesh
 from casadi_ik.model.pose import inverse
@@ -31,9 +38,7 @@ TABLE = MeshTable(
     {PACKAGE: PackageEntry("made_up_robots/data")},
     {
         "panda": [
-            VisualMeshEntry(
-                PACKAGE, "arm/arm.urdf", "MIT", {"panda_base": "base"}, JOINTS, ["cover"]
-            )
+            VisualMeshEntry(PACKAGE, "MIT", "arm/*.urdf", {"panda_base": "base"}, JOINTS, ["cover"])
         ]
     },
 )
@@ -44,12 +49,18 @@ SHIFT[:3] = [[0.8, -0.6, 0, 0], [0.6, 0.8, 0, 0], [0, 0, 1, 0.05]]
 BOX = '<visual><origin xyz="{}"/><geometry><box size="0.02 0.02 0.02"/></geometry>{}</visual>'
 
 
-def write_package(site: Path, error: float = 0.0) -> None:
+def about_z(degrees: float) -> Array:
+    """Return the (4, 4) rotation about z."""
+    return frame_matrix(Frame(rpy=(0.0, 0.0, np.deg2rad(degrees))))
+
+
+def write_package(site: Path, error: float = 0.0, turned: bool = False) -> None:
     """Write an installed package with a Panda whose frames differ from those of the robot.
 
     Args:
         site: Folder of installed packages.
         error: Displacement of an axis [m].
+        turned: Whether the base is turned by 90 deg, and the zero of the second axis by 30 deg.
     """
     info = site / "made_up_robots-1.0.dist-info"
     info.mkdir()
@@ -66,6 +77,9 @@ def write_package(site: Path, error: float = 0.0) -> None:
     for i, joint in enumerate(joints, 1):
         placement = (inverse(SHIFT) if i > 1 else np.eye(4)) @ joint.placement @ SHIFT
         placement[:3, 3] += error * (i == 4) * placement[:3, 0]
+        if turned and i <= 2:
+            turn = about_z(-90.0) if i == 1 else about_z(-30.0)
+            placement = turn @ placement if i == 1 else placement @ turn
         xyz, rpy = placement[:3, 3], roll_pitch_yaw(placement[:3, :3])
         origin = f'xyz="{xyz[0]} {xyz[1]} {xyz[2]}" rpy="{rpy[0]} {rpy[1]} {rpy[2]}"'
         box = BOX.format("0 0 0", '<material name="red"/>')
@@ -109,6 +123,59 @@ def test_meshes_of_an_installed_package_are_placed_and_colored(site: Path) -> No
             assert centers[key] == pytest.approx(center, abs=1e-6)
 
 
+def test_frames_and_zeros_may_differ(site: Path) -> None:
+    write_package(site, turned=True)
+    description = ik.load_robot("panda").description
+    entry = TABLE.robots["panda"][0]
+    assert not package_meshes(description, TABLE).by_link
+    turned = structs.replace(
+        entry, rpy=(0.0, 0.0, np.pi / 2), zeros={"panda_joint_2": np.deg2rad(30.0)}
+    )
+    meshes = package_meshes(description, MeshTable(TABLE.packages, {"panda": [turned]}))
+    for i in range(1, 8):
+        (part,) = [part for part in meshes.by_link[f"panda_link_{i}"] if part.color]
+        assert part.mesh.points.mean(axis=0) == pytest.approx(SHIFT[:3, 3], abs=1e-6)
+
+
+def git(folder: Path, *arguments: str) -> str:
+    """Run Git in a folder and return its output."""
+    settings = ("-c", "user.name=x", "-c", "user.email=x@example.org")
+    command = ["git", "-C", str(folder), *settings, *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_repositories_are_fetched_and_place_meshes(site: Path, tmp_path: Path) -> None:
+    repository = tmp_path / "repository"
+    for folder in ("meshes", "other"):
+        (repository / folder).mkdir(parents=True)
+        trimesh.creation.box((0.1, 0.1, 0.1)).export(repository / folder / "box.stl")
+    git(repository, "init", "--quiet")
+    git(repository, "add", ".")
+    git(repository, "commit", "--quiet", "-m", "boxes")
+    commit = git(repository, "rev-parse", "HEAD")
+    files = [MeshFileEntry("meshes/box.stl", (0.0, 0.0, 0.3), (0.0, 0.0, 0.0), "#000000")]
+    table = MeshTable(
+        {"boxes": PackageEntry(repository=repository.as_uri(), commit=commit)},
+        {"panda": [VisualMeshEntry("boxes", "MIT", meshes={"panda_link_3": files})]},
+    )
+    description = ik.load_robot("panda").description
+    assert not package_meshes(description, table).by_link
+    folder = fetch_repository("boxes", table)
+    assert {path.name for path in folder.iterdir()} == {".git", "meshes"}
+    meshes = package_meshes(description, table)
+    assert meshes.covered_links == {"panda_link_3"}
+    (part,) = meshes.by_link["panda_link_3"]
+    assert part.mesh.points.mean(axis=0) == pytest.approx([0, 0, 0.3])
+    assert min(palette.rgb(part.color)) > 0  # black is lightened, so that shading is visible
+
+
+def test_packages_on_the_index_are_not_fetched(site: Path) -> None:
+    assert not list(site.iterdir())
+    with pytest.raises(ik.errors.InputError, match=PACKAGE):
+        fetch_repository(PACKAGE, TABLE)
+
+
 @pytest.mark.parametrize("write", [None, lambda site: write_package(site, error=5e-3)])
 def test_missing_and_different_robots_are_not_used(
     site: Path, write: Callable[[Path], None] | None
@@ -129,7 +196,7 @@ def test_each_arm_of_a_multi_arm_robot_has_meshes(site: Path) -> None:
 
 def test_links_without_meshes_are_drawn_by_collision_shapes(site: Path) -> None:
     assert not list(site.iterdir())
-    robot = ik.load_robot("trifinger")  # no package contains it
+    robot = ik.load_robot("irb140+barrett_bh8_280")
     frames = [body.frame for body in visual_bodies(robot) if body.role != "pad"]
     assert {body.frame for body in collision_bodies(robot)} <= set(frames)
 
@@ -144,7 +211,8 @@ def test_entries_name_joints_and_links_of_built_in_robots() -> None:
             assert entry.licence
             assert entry.package in table.packages
             assert any(
-                set(entry.joints) <= set(robot.joint_names) and set(entry.base) <= set(robot.links)
+                set(entry.joints) <= {joint.name for joint in robot.joints}
+                and set(entry.links) <= set(robot.links)
                 for robot in robots
             )
 

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, ClassVar
 from casadi_ik.errors import CasadiIKError, printable
 
 if TYPE_CHECKING:
+    from argparse import Namespace as Arguments
+
     from rich.console import RenderableType
 
 
@@ -54,11 +56,11 @@ def _run(words: Sequence[str]) -> int:
         warnings.showwarning = show_warning
         try:
             run, args = parse(words)
-            with _size_limits(getattr(args, "size_limits", None)):
+            with _environment(args):
                 result = run(args)
-            _show(result.report)
-            if result.epilogue is not None:
-                result.epilogue()
+                _show(result.report)
+                if result.epilogue is not None:
+                    result.epilogue()
             return result.exit
         except CasadiIKError as error:
             print_message("error", str(error))
@@ -186,17 +188,23 @@ def _abandon_stdout() -> None:
 
 
 @contextmanager
-def _size_limits(factor: float | None) -> Iterator[None]:
-    """Multiply the size limits of input files by a factor, also in child processes."""
+def _environment(args: Arguments) -> Iterator[None]:
+    """Set the environment variables of options, also for child processes."""
+    from casadi_ik.app.drawing import MESHES_VARIABLE
     from casadi_ik.files.limits import LIMITS_VARIABLE
 
-    previous = os.environ.get(LIMITS_VARIABLE)
-    if factor is not None:
-        os.environ[LIMITS_VARIABLE] = repr(factor)
+    changes: dict[str, str] = {}
+    if (factor := getattr(args, "size_limits", None)) is not None:
+        changes[LIMITS_VARIABLE] = repr(factor)
+    if not getattr(args, "meshes", True):
+        changes[MESHES_VARIABLE] = "off"
+    previous = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
     try:
         yield
     finally:
-        if factor is not None:
-            del os.environ[LIMITS_VARIABLE]
-        if previous is not None:
-            os.environ[LIMITS_VARIABLE] = previous
+        for name, value in previous.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

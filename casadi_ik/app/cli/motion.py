@@ -163,6 +163,7 @@ def _collision_text(solver: Solver) -> str:
     opt.ROBOT,
     MOTION,
     opt.picture("--animation", "animation in real time"),
+    opt.MESHES,
     opt.OBJECT_POSE,
     opt.SCENE_FILE,
     Option("--opening METRES", "gap between open fingertips and contacts [m]", 0.02),

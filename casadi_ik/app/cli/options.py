@@ -313,6 +313,7 @@ def diagnose(default: bool) -> Option:
     )
 
 
+MESHES = Option("--[no-]meshes", "draw visual meshes of robots (default: yes)", True)
 BEST_EFFORT = Option("--best-effort", "nearest configuration of unsolved targets")
 
 

@@ -65,6 +65,7 @@ POSE_TOLERANCE = 1e-9
     Option("--xacro", "expand macros in files without the suffix .xacro"),
     Option("--xacro-args NAME:=VALUE...", "arguments of a xacro file"),
     opt.picture("--picture", "picture of the guessed pads"),
+    opt.MESHES,
     Option("--check", "compare the kinematics with pinocchio (MJCF: MuJoCo)"),
     opt.SIZE_LIMITS,
 )

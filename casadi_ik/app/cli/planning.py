@@ -60,6 +60,7 @@ from casadi_ik.solve.solution_files import RANKED_MEMBER, ranking_data
     Option("--jobs N", "threads", 1, opt.integer(1)),
     opt.out_option("FOUND.npz", "output file of the grasps"),
     opt.picture("--picture", "picture of the best nine grasps"),
+    opt.MESHES,
     Option("--view", "show the grasps in the browser (needs 'casadi-ik[view]')"),
 )
 def grasp(args: Arguments) -> CommandResult:

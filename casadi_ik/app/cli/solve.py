@@ -50,6 +50,7 @@ SLOW_FIRST_SOLVE = 1.0
     Option("--out FILE.json", "output file of the solution", parse=opt.json_name),
     opt.picture("--picture", "picture of the grasp"),
     opt.picture("--picture-dark", "picture on a dark background"),
+    opt.MESHES,
     opt.diagnose(default=True),
     opt.BEST_EFFORT,
     opt.SIZE_LIMITS,

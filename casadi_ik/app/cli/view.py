@@ -64,6 +64,7 @@ SOLVE_NUMBERS = opt.word_list(opt.integer(1))
         parse=SOLVE_NUMBERS,
     ),
     Option("--pads", "edit the pads of a robot file"),
+    opt.MESHES,
     Option(
         "--host ADDRESS",
         "server address; 0.0.0.0: all (default: 127.0.0.1)",

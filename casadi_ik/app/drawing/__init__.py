@@ -1,1 +1,4 @@
-"""What there is to draw, for pictures and pages alike."""
+"""Shapes and colours of what pictures and pages draw."""
+
+MESHES_VARIABLE = "CASADI_IK_MESHES"
+"""Environment variable; "off" disables visual meshes."""

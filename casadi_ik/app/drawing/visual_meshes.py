@@ -1,35 +1,44 @@
-"""Visual meshes of robots: from their own files, or from packages that are installed.
+"""Visual meshes of robots: from their own files, or from packages and repositories.
 
 Built-in robots have no mesh files. The table `models/viewer/visual_meshes.yaml` names the
-descriptions of the same robots in other packages. A package is used if it is installed; nothing is
-imported from it, and nothing is fetched. The links of both descriptions are matched by their
+descriptions of the same robots in other packages and repositories. A package is used if it is
+installed, a repository if it was fetched (`casadi-ik meshes --fetch`); nothing is imported from
+them, and nothing is fetched without a request. The links of both descriptions are matched by their
 joints, and forward kinematics at random configurations decide whether the match is right: a
 description whose links move by more than `MAX_DEVIATION` relative to those of the robot is not
-used.
+used. `CASADI_IK_MESHES=off` in the environment disables all visual meshes.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator, Mapping
+import os
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec import Struct
 
+from casadi_ik.app.drawing import MESHES_VARIABLE, palette
+from casadi_ik.app.drawing.mesh_table import (
+    MeshFileEntry,
+    MeshTable,
+    VisualMeshEntry,
+    candidates,
+    covered_links,
+    find_file,
+    mesh_table,
+)
 from casadi_ik.app.drawing.surfaces import decimate, join_surfaces
 from casadi_ik.compile import cache_directory
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.number_files import READ_ERRORS
-from casadi_ik.files.reading import read, read_yaml
-from casadi_ik.files.shipped import models_folder
+from casadi_ik.files.number_files import READ_ERRORS, read_mesh_parts
+from casadi_ik.files.reading import Frame, frame_matrix, read_yaml
 from casadi_ik.files.writing import atomic_write
 from casadi_ik.integrations.importing.meshes import ColoredMesh, IndexedMesh, link_mesh_parts
 from casadi_ik.integrations.importing.robot_import import read_referenced_tree
@@ -42,7 +51,7 @@ from casadi_ik.model.xml_tree import RobotTree
 
 logger = logging.getLogger(__name__)
 
-MAX_DEVIATION = 1e-3
+MAX_DEVIATION = 2e-3
 """Largest motion of a matched link relative to the robot's link, `LEVER` from its origin [m]."""
 
 LEVER = 0.2
@@ -54,54 +63,10 @@ CONFIGURATION_COUNT = 8
 MAX_LINK_TRIANGLES = 4000
 """Number of triangles to which the meshes of a link are reduced."""
 
+DARKEST = 56
+"""Smallest value of the brightest channel of a drawn colour, 0 to 255."""
+
 MeshesByLink = Mapping[str, tuple[ColoredMesh, ...]]
-
-
-class PackageEntry(Struct, frozen=True):
-    """A package that contains descriptions of robots.
-
-    Attributes:
-        folder: Folder of the descriptions, relative to the folder of installed packages.
-        clones: Further folders that may hold them, such as the cache of `robot_descriptions`; "~"
-            is the home folder.
-    """
-
-    folder: str
-    clones: list[str] = []
-
-
-class VisualMeshEntry(Struct, frozen=True):
-    """The description of a robot in a package.
-
-    Attributes:
-        package: Name of the package.
-        file: URDF or MJCF, relative to the folder of the package.
-        licence: Licence of the meshes.
-        base: Link of the file by link of the robot with the same frame. Fixed links of the robot
-            that are one link of the file are listed one by one; the last one carries its meshes.
-        joints: Joint of the file by joint of the robot. A minus sign before the name reverses the
-            direction.
-        extra: Links of the file that are drawn as well, with the nearest matched link.
-    """
-
-    package: str
-    file: str
-    licence: str
-    base: dict[str, str]
-    joints: dict[str, str]
-    extra: list[str] = []
-
-
-class MeshTable(Struct, frozen=True):
-    """The content of `models/viewer/visual_meshes.yaml`.
-
-    Attributes:
-        packages: Packages by their names on the index.
-        robots: Descriptions by robot, the preferred one of a robot first.
-    """
-
-    packages: dict[str, PackageEntry]
-    robots: dict[str, list[VisualMeshEntry]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,13 +84,20 @@ class VisualMeshes:
     origins: tuple[tuple[str, str], ...] = ()
 
 
-@lru_cache(maxsize=16)
 def visual_meshes(description: RobotDescription) -> VisualMeshes:
-    """Return the visual meshes of a robot, reduced for drawing.
+    """Return the visual meshes of a robot, reduced for drawing; none if they are disabled.
 
     They are those of the files that the description refers to, otherwise those of installed
-    packages. Problems with files are logged: a robot can be drawn without meshes.
+    packages and fetched repositories. Problems with files are logged: a robot can be drawn without
+    meshes.
     """
+    return (
+        VisualMeshes() if os.environ.get(MESHES_VARIABLE) == "off" else _visual_meshes(description)
+    )
+
+
+@lru_cache(maxsize=16)
+def _visual_meshes(description: RobotDescription) -> VisualMeshes:
     try:
         meshes = {} if description.path is None else file_mesh_parts(description, visual=True)
     except CasadiIKError as error:
@@ -177,20 +149,15 @@ def file_mesh_parts(
     }
 
 
-def mesh_table() -> MeshTable:
-    """Return the table of descriptions in other packages."""
-    return read(models_folder() / "viewer" / "visual_meshes.yaml", MeshTable)[0]
-
-
 def package_meshes(description: RobotDescription, table: MeshTable) -> VisualMeshes:
-    """Return the visual meshes of a robot, or of parts of it, that installed packages contain."""
+    """Return the visual meshes of a robot, or of parts of it, that packages contain."""
     by_link: dict[str, tuple[ColoredMesh, ...]] = {}
     covered: set[str] = set()
     origins: list[tuple[str, str]] = []
     for entries in table.robots.values():
-        for entry, prefix in _candidates(description, entries):
-            new_links = _covered_links(description, entry, prefix) - covered
-            path = find_file(table.packages[entry.package], entry)
+        for entry, prefix in candidates(description, entries):
+            new_links = covered_links(description, entry, prefix) - covered
+            path = find_file(entry.package, table, entry)
             if path is None or not new_links:
                 continue
             try:
@@ -205,36 +172,6 @@ def package_meshes(description: RobotDescription, table: MeshTable) -> VisualMes
     return VisualMeshes(by_link, frozenset(covered), tuple(dict.fromkeys(origins)))
 
 
-def find_file(package: PackageEntry, entry: VisualMeshEntry) -> Path | None:
-    """Return the description of a robot in a package; None if it is not installed."""
-    folders = [Path(clone).expanduser() for clone in package.clones]
-    with suppress(metadata.PackageNotFoundError):
-        distribution = metadata.distribution(entry.package)
-        folders.insert(0, Path(str(distribution.locate_file(package.folder))))
-    files = (folder / entry.file for folder in folders)
-    return next((file for file in files if file.is_file()), None)
-
-
-def _candidates(
-    description: RobotDescription, entries: list[VisualMeshEntry]
-) -> Iterator[tuple[VisualMeshEntry, str]]:
-    """Return the entries whose joints the robot has, with the prefix of the robot's names."""
-    for entry in entries:
-        first = next(iter(entry.joints))
-        names = [name for name in description.joint_names if name.endswith(first)]
-        for prefix in [name.removesuffix(first) for name in names]:
-            has_joints = {prefix + name for name in entry.joints} <= set(description.joint_names)
-            if has_joints and {prefix + link for link in entry.base} <= set(description.links):
-                yield entry, prefix
-
-
-def _covered_links(description: RobotDescription, entry: VisualMeshEntry, prefix: str) -> set[str]:
-    """Return the links of the robot that an entry draws."""
-    names = {prefix + name for name in entry.joints}
-    children = {joint.child for joint in description.movable if joint.name in names}
-    return children | {prefix + link for link in entry.base}
-
-
 def _entry_meshes(
     description: RobotDescription, entry: VisualMeshEntry, prefix: str, path: Path
 ) -> MeshesByLink:
@@ -243,8 +180,18 @@ def _entry_meshes(
     cached = _read_cache(key)
     if cached is not None:
         return cached
+    if entry.meshes:
+        root = path.parents[len(Path(entry.all_files[0]).parts) - 1]
+        meshes = {
+            prefix + link: reduced_parts(
+                [part for file in files for part in _posed_parts(root, file)]
+            )
+            for link, files in entry.meshes.items()
+        }
+        _write_cache(key, meshes)
+        return meshes
     tree = read_tree(path)
-    joints = {joint.name: joint for joint in description.movable}
+    joints = {joint.name: joint for joint in description.joints}
     matches = {prefix + ours: theirs.lstrip("-") for ours, theirs in entry.joints.items()}
     links = {theirs: prefix + ours for ours, theirs in entry.base.items()} | {
         tree.by_name[tree.require_joint(theirs, str(path))].child: joints[ours].child
@@ -268,6 +215,18 @@ def _entry_meshes(
     return meshes
 
 
+def _posed_parts(root: Path, entry: MeshFileEntry) -> list[ColoredMesh]:
+    """Return the meshes of a file in the frame of a link."""
+    pose = frame_matrix(Frame(entry.xyz, entry.rpy))
+    parts = read_mesh_parts(root / entry.file, str(root / entry.file))
+    return [
+        ColoredMesh(
+            IndexedMesh(part.points, part.triangles), part.color or entry.color
+        ).transformed(pose)
+        for part in parts
+    ]
+
+
 def _compare(
     description: RobotDescription,
     tree: RobotTree,
@@ -283,11 +242,14 @@ def _compare(
         ours[joint.name] = np.concatenate([[0.0], rng.uniform(low, high, CONFIGURATION_COUNT)])
     for name, file_name in entry.joints.items():
         sign = -1.0 if file_name.startswith("-") else 1.0
-        theirs[file_name.lstrip("-")] = sign * ours[prefix + name]
+        theirs[file_name.lstrip("-")] = sign * ours.get(prefix + name, 0.0) + entry.zeros.get(
+            name, 0.0
+        )
     our_poses = link_poses(description.root, description.joints, ours)
     their_poses = link_poses(tree.root, tree.joints, theirs)
     base = next(iter(entry.base.values()))
-    to_file, to_base = inverse(our_poses[links[base]]), inverse(their_poses[base])
+    to_file = inverse(our_poses[links[base]])
+    to_base = frame_matrix(Frame(entry.xyz, entry.rpy)) @ inverse(their_poses[base])
     offsets, deviation = {}, 0.0
     for link, our_link in links.items():
         relative = inverse(to_file @ our_poses[our_link]) @ to_base @ their_poses[link]
@@ -316,7 +278,7 @@ def reduced_parts(parts: list[ColoredMesh]) -> tuple[ColoredMesh, ...]:
     """Return the meshes of a link, one per colour, with about `MAX_LINK_TRIANGLES` in total."""
     by_color: dict[str, list[IndexedMesh]] = {}
     for part in parts:
-        by_color.setdefault(part.color, []).append(part.mesh)
+        by_color.setdefault(visible_color(part.color), []).append(part.mesh)
     meshes = {color: join_surfaces(surfaces) for color, surfaces in by_color.items()}
     count = sum(len(mesh.triangles) for mesh in meshes.values())
     share = min(1.0, MAX_LINK_TRIANGLES / max(count, 1))
@@ -327,6 +289,15 @@ def reduced_parts(parts: list[ColoredMesh]) -> tuple[ColoredMesh, ...]:
     )
 
 
+def visible_color(color: str) -> str:
+    """Return a colour bright enough for shading: black has no darker side."""
+    if not color:
+        return ""
+    channels = palette.rgb(color)
+    added = max(0, DARKEST - max(channels))
+    return "#{:02x}{:02x}{:02x}".format(*(channel + added for channel in channels))
+
+
 # Cache. Reading and reducing the meshes of a robot takes seconds.
 
 
@@ -334,13 +305,14 @@ def _cache_key(
     description: RobotDescription, entry: VisualMeshEntry, prefix: str, path: Path
 ) -> str:
     """Return a hash of everything that the meshes of an entry depend on."""
+    folder = path.parents[1] if path.parent.name in ("urdf", "robots") else path.parent
     stamps = sorted(
         (str(file), file.stat().st_size, file.stat().st_mtime_ns)
-        for file in path.parents[1].rglob("*")
+        for file in folder.rglob("*")
         if file.is_file()
     )
     placements = [joint.placement.tobytes() for joint in description.joints]
-    content = (stamps, entry, prefix, description.joints, placements, MAX_LINK_TRIANGLES)
+    content = (stamps, entry, prefix, description.joints, placements, MAX_LINK_TRIANGLES, DARKEST)
     return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
