@@ -320,7 +320,8 @@ class Log:
             fields: Names of the fields; None: all.
 
         Returns:
-            At least one part; parts without rows only if there are no rows at all.
+            Parts with rows; if there are no rows, one part without rows, or none if no file has the
+            topic.
 
         Raises:
             LogError: A file cannot be read, or a solve is in two files.
@@ -328,7 +329,7 @@ class Log:
         sources = self.sources
         groups: dict[str, list[MethodRows]] = {}
         for i, shard in enumerate(self.shards):
-            if method not in shard.methods:
+            if (method, kind) not in shard.topics:
                 continue
             offset = sources.offsets[i]
             in_shard = None if numbers is None else numbers[numbers >= offset] - offset
@@ -336,6 +337,9 @@ class Log:
                 part = shard.solves(method)
             else:
                 part = shard.read(method, kind, in_shard, fields)
+            if kind != "solve" and len(self.shards) > 1:
+                # A truncated file may end within a solve, whose number another file may have.
+                part = part.where(np.isin(part.solve_id, shard.solve_numbers(method)))
             if offset:
                 rows = part.rows.copy()
                 if "solve_id" in part.names:
@@ -390,8 +394,11 @@ class Log:
         """Check that names are labels of a field for at least one method.
 
         Raises:
-            UnknownNameError: A name is not a label of any method.
+            UnknownNameError: A name is not a label of any method. Without parts, labels are
+                unknown, and every name is accepted.
         """
+        if not parts:
+            return
         labels = dict.fromkeys(label for part in parts for label in part.labels.get(field, ()))
         for name in _names(values):
             if name not in labels or not name:

@@ -12,7 +12,6 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import IO
 
@@ -48,7 +47,6 @@ from casadi_ik.logs.container import (
 )
 from casadi_ik.logs.format import (
     CHECKSUM,
-    MESSAGE_KINDS,
     METADATA_NAME,
     SHARDS,
     parse_layout,
@@ -246,8 +244,7 @@ class _Merge:
         for shard in log.shards:
             topics, has_same_ids = dict[int, tuple[int, str, Layout]](), True
             summary = shard.contents.summary
-            for method, kind in product(shard.methods, MESSAGE_KINDS):
-                topic = shard.topic(method, kind)
+            for (method, kind), topic in shard.topics.items():
                 channel = summary.channels[topic.channel]
                 number = numbers.setdefault(channel.topic, len(numbers) + 1)
                 if number >= 2**16:
@@ -259,7 +256,7 @@ class _Merge:
                 first_schema = self.summary.schemas.setdefault(number, schema)
                 first_channel = self.summary.channels.setdefault(number, channel)
                 if not _same_fields(first_schema, schema) or first_channel != channel:
-                    holder = next(item.path for item in log.shards if method in item.methods)
+                    holder = next(item.path for item in log.shards if (method, kind) in item.topics)
                     raise LogError(
                         f"{shard.path}: method {method!r} has other fields or names than in"
                         f" {holder} ({channel.topic})"

@@ -79,6 +79,8 @@ class Shard:
         record: Metadata record as text by key.
         metadata: Metadata with structured values parsed.
         robot: Name of the robot.
+        topics: Topics by method and kind. A file that another program wrote may lack topics without
+            messages, because some writers define a channel with its first message.
         methods: Names of the methods.
         clock: Rule of the log times.
     """
@@ -101,17 +103,13 @@ class Shard:
             self.metadata: Mapping[str, Any] = parse_metadata(self.record)
             self.robot: str = self.metadata["robot"]
             self.clock = clock_from_metadata(self.metadata)
-            self._topics = self._parse_topics()
-            self.methods: tuple[str, ...] = tuple(dict.fromkeys(name for name, _ in self._topics))
+            self.topics = self._parse_topics()
+            self.methods: tuple[str, ...] = tuple(dict.fromkeys(name for name, _ in self.topics))
         self._solves: dict[str, MethodRows] = {}
 
-    def topic(self, method: str, kind: str) -> Topic:
-        """Return the topic of a kind of messages of one of the `methods`."""
-        return self._topics[method, kind]
-
     def count(self, method: str, kind: str) -> int:
-        """Return the number of messages of a kind; 0 if the file does not hold the method."""
-        entry = self._topics.get((method, kind))
+        """Return the number of messages of a kind; 0 if the file does not hold the topic."""
+        entry = self.topics.get((method, kind))
         return 0 if entry is None else self.contents.counts.get(entry.channel, 0)
 
     def attachments(self) -> dict[str, Attachment]:
@@ -127,7 +125,9 @@ class Shard:
             }
 
     def solves(self, method: str) -> MethodRows:
-        """Return all solves of a method in the order of the file; they are cached.
+        """Return all solves of a method whose solves have a topic, in the order of the file.
+
+        The result is cached.
 
         Raises:
             LogError: The file is damaged.
@@ -135,6 +135,15 @@ class Shard:
         if method not in self._solves:
             self._solves[method] = self.read(method, "solve")
         return self._solves[method]
+
+    def solve_numbers(self, method: str) -> Counts:
+        """Return the numbers of the solves of a method in the order of the file.
+
+        Raises:
+            LogError: The file is damaged.
+        """
+        has_solves = (method, "solve") in self.topics
+        return self.solves(method).solve_id if has_solves else np.zeros(0, np.int64)
 
     def read(
         self,
@@ -146,8 +155,8 @@ class Shard:
         """Read rows in the order of the file.
 
         Args:
-            method: One of `methods`.
-            kind: "solve", "iteration" or "event".
+            method: Method of one of the `topics`.
+            kind: Kind of this topic: "solve", "iteration" or "event".
             solves: Sorted numbers of the solves; None: all.
             fields: Names of the fields; None: all.
 
@@ -155,7 +164,7 @@ class Shard:
             UnknownNameError: A field does not exist.
             LogError: The file is damaged.
         """
-        entry, name = self._topics[method, kind], topic(method, kind)
+        entry, name = self.topics[method, kind], topic(method, kind)
         for field in fields or ():
             if field not in entry.layout.names:
                 names = ", ".join(entry.layout.names)
@@ -205,25 +214,23 @@ class Shard:
         """Return the topics by method and kind.
 
         Raises:
-            LogError: A topic is missing, or its schema or labels are invalid.
+            LogError: The schema of a topic is missing, or its schema or labels are invalid.
         """
         summary = self.contents.summary
-        channels = {channel.topic: channel for channel in summary.channels.values()}
         topics: dict[tuple[str, str], Topic] = {}
-        for first_channel in summary.channels.values():
-            method = first_channel.metadata.get("method")
-            if method is None or first_channel.topic != topic(method, MESSAGE_KINDS[0]):
+        for channel in summary.channels.values():
+            method = channel.metadata.get("method")
+            kind = next((kind for kind in MESSAGE_KINDS if channel.topic.endswith(f"/{kind}")), "")
+            if method is None or channel.topic != topic(method, kind):
                 continue
             if not 0 < len(method) <= 200:
                 raise LogError(
                     f"method: found a name of {len(method)} characters, expected 1 to 200"
                 )
-            for kind in MESSAGE_KINDS:
-                channel = channels.get(topic(method, kind))
-                if channel is None or channel.schema_id not in summary.schemas:
-                    raise LogError(f"topic {topic(method, kind)!r} or its schema is missing")
-                layout, labels = parse_channel(kind, channel, summary.schemas[channel.schema_id])
-                topics[method, kind] = Topic(channel.id, layout, labels)
+            if channel.schema_id not in summary.schemas:
+                raise LogError(f"topic {channel.topic!r}: its schema is missing")
+            layout, labels = parse_channel(kind, channel, summary.schemas[channel.schema_id])
+            topics[method, kind] = Topic(channel.id, layout, labels)
         return topics
 
 
@@ -526,15 +533,16 @@ def _offsets(shards: Sequence[Shard]) -> list[int]:
     """
     share_numbers = False
     for method in dict.fromkeys(method for shard in shards for method in shard.methods):
-        holders = [shard for shard in shards if method in shard.methods]
-        numbers = np.concatenate([shard.solves(method).solve_id for shard in holders])
+        numbers = np.concatenate([shard.solve_numbers(method) for shard in shards])
         if len(np.unique(numbers)) < len(numbers):
-            _check_distinct(method, holders)
+            _check_distinct(
+                method, [shard for shard in shards if (method, "solve") in shard.topics]
+            )
             share_numbers = True
     if not share_numbers:
         return [0] * len(shards)
     last_numbers = [
-        [int(shard.solves(method).solve_id.max(initial=-1)) for method in shard.methods]
+        [int(shard.solve_numbers(method).max(initial=-1)) for method in shard.methods]
         for shard in shards
     ]
     counts = (max(numbers, default=-1) + 1 for numbers in last_numbers)

@@ -66,6 +66,39 @@ def test_the_summary_and_its_parts_are_optional(log: Path, options: dict[str, An
     assert not logs.finish_log(copy).changed
 
 
+@pytest.mark.parametrize("kind", ["iteration", "solve", "event"])
+@pytest.mark.parametrize(
+    "options", [{"chunk_size": 1, "compression": CompressionType.NONE}, {"use_chunking": False}]
+)
+def test_a_rewritten_log_is_cut_before_the_first_message_of_a_kind(
+    write: Write, kind: str, options: dict[str, Any], tmp_path: Path
+) -> None:
+    """Writers of other programs define a channel just before its first message."""
+    copy = rewritten(write(make_block(6, 20), robot_name="cut"), **options)
+    data = copy.read_bytes()
+    # The text of a topic also names its channel; the cut is just before this definition.
+    copy.write_bytes(data[: data.index(f"/ik/enhanced-dls/{kind}".encode())])
+    log = logs.open(copy)
+    assert log.info().unfinished == (copy,)
+    tables = {
+        "iteration": log.iterations(phase="refinement"),
+        "solve": log.solves(status="SOLVED"),
+        "event": log.events(),
+    }
+    assert len(tables[kind]) == 0
+    recorded = [number for part in tables["solve"].parts for number in part.solve_id.tolist()]
+    complete = write(make_block(4, 20), robot_name="cut", name="complete.mcap")
+    both = logs.open([copy, complete])
+    assert len(both.solves()) == 2 + len(recorded)
+    assert len(both.iterations()) == 24 + len(log.iterations(solve=recorded))
+    assert [main(["log", name, str(copy)]) for name in ("info", "solves", "events")] == [0, 0, 0]
+    finished = logs.finish_log(copy)
+    assert finished.changed
+    assert len(logs.open(copy).iterations()) == len(log.iterations())
+    merged = logs.merge_logs([copy], tmp_path / "merged.mcap")
+    assert sum(merged.solves.values()) == len(recorded)
+
+
 def without_summary(path: Path) -> Path:
     """Copy a log up to the end of its data, with an empty footer and no summary."""
     end = path.read_bytes().rindex(bytes([0x0F]) + (4).to_bytes(8, "little") + bytes(4))
