@@ -59,7 +59,7 @@ MODES: Mapping[str, Mapping[str, Any]] = {
 
 WARNINGS = ("-std=c11", "-pedantic", "-Wall", "-Wextra", "-Werror")
 SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-TIMEOUT = 1800
+TIMEOUT = 7200
 """Longest time of a test [s]."""
 
 INTRODUCTION = """
