@@ -22,8 +22,7 @@ import numpy as np
 from casadi_ik.api import Solver
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, KernelError, MissingExtraError, UnsupportedError, os_errors
-from casadi_ik.export.multi_arm_scene import MultiArmSceneSources
-from casadi_ik.export.scene import SceneSources
+from casadi_ik.export.scene import MultiArmSceneSources, SceneSources
 from casadi_ik.export.single import SinglePrecision, render_template
 from casadi_ik.export.solver import FollowSources, SolverSources, prepared_method
 from casadi_ik.export.targets import (

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import UnknownNameError, UnsupportedError
 from casadi_ik.files.arrays import Array, read_only
-from casadi_ik.model.joints import Actuator, Joint, chain_to, links_of
+from casadi_ik.model.joints import Actuator, Joint, chain_to, links_of, motor_ranges
 from casadi_ik.model.link_shapes import NO_SHAPES, Shapes
-from casadi_ik.model.motor_ranges import motor_ranges
 
 CONTINUOUS_LIMIT = 1e6
 """Limit of the motion of a motor without limits [rad]: 28 hours at 10 rad/s."""

@@ -17,9 +17,8 @@ from casadi_ik.files.reading import Vector, frame_matrix, read
 from casadi_ik.files.shipped import resolve_description
 from casadi_ik.model.description import Finger, RobotDescription
 from casadi_ik.model.imported_parts import arm_from_file
-from casadi_ik.model.joints import Actuator, Joint, chain_to, require_name
+from casadi_ik.model.joints import Actuator, Joint, chain_to, motor_ranges, require_name
 from casadi_ik.model.link_shapes import NO_SHAPES
-from casadi_ik.model.motor_ranges import motor_ranges
 from casadi_ik.model.parts import (
     RobotPart,
     part_from_file,

@@ -12,8 +12,7 @@ from toy_robots import grasp_at
 
 import casadi_ik as ik
 from casadi_ik.integrations.importing.reference_kinematics import largest_difference
-from casadi_ik.integrations.importing.robot_shapes import robot_shapes
-from casadi_ik.integrations.importing.triangle_tree import CollisionTree
+from casadi_ik.integrations.importing.robot_shapes import CollisionTree, robot_shapes
 from casadi_ik.model.urdf_mjcf import read_tree
 
 MOUNT = "mount: {xyz: [0.01, 0.02, 0.03], rpy: [0.1, 0.2, 0.3]}"

@@ -13,7 +13,7 @@ import numpy as np
 
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.reading import roll_pitch_yaw
-from casadi_ik.integrations.importing.pads import Pad
+from casadi_ik.integrations.importing.fingers import Pad
 from casadi_ik.model.link_shapes import Touching
 from casadi_ik.model.schema import ShapeEntry
 
