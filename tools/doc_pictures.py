@@ -5,7 +5,7 @@
 
 The pictures show the frames of a contact, an obstacle with and without a scene, eight arm-hands, an
 unreachable grasp, a humanoid that holds a box, and all built-in arms, hands and multi-arm robots.
-Robots have visual meshes if the package `example-robot-data` is installed.
+Robots have the visual meshes that are on the machine (`casadi-ik meshes`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ PAIRS = (
     ("kuka_lwr_barrett", "LWR 4+ · Barrett"),
     ("panda+allegro_right", "Panda · Allegro"),
     ("ur5e+shadow", "UR5e · Shadow"),
-    ("xarm6+leap", "xArm 6 · LEAP"),
+    ("xarm7+inspire_rh56", "xArm 7 · Inspire"),
     ("iiwa14+schunk_svh", "iiwa 14 · SVH"),
     ("kinova_gen3+robotiq_3f", "Gen3 · Robotiq 3F"),
     ("sawyer+unitree_dex3", "Sawyer · Dex3"),
@@ -49,7 +49,7 @@ PAIRS = (
 )
 
 POST = {
-    "table": {"kind": "box", "size": [2.0, 2.0, 0.04], "xyz": [0, 0, -0.02]},
+    "table": {"kind": "box", "size": [1.4, 1.0, 0.04], "xyz": [-0.45, 0, -0.02]},
     "post": {"kind": "cylinder", "radius": 0.04, "length": 1.0},
 }
 

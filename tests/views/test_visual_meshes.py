@@ -14,7 +14,7 @@ from msgspec import structs
 
 import casadi_ik as ik
 from casadi_ik.app.drawing import palette
-from casadi_ik.app.drawing.drawables import collision_bodies, visual_bodies
+from casadi_ik.app.drawing.drawables import bodies_at, collision_bodies, visual_bodies
 from casadi_ik.app.drawing.mesh_table import (
     MeshFileEntry,
     MeshTable,
@@ -194,9 +194,29 @@ def test_each_arm_of_a_multi_arm_robot_has_meshes(site: Path) -> None:
     assert {"left_panda_base", "left_panda_link_7", "right_panda_link_7"} <= links
 
 
+@pytest.mark.parametrize("name", ["kuka_lwr_barrett", "mobile_kuka_lwr_barrett"])
+def test_hulls_have_the_size_of_the_robot(site: Path, name: str) -> None:
+    assert not list(site.iterdir())
+    robot, table = ik.load_robot(name), mesh_table()
+    meshes = package_meshes(robot.description, structs.replace(table, packages={}, robots={}))
+    shapes = bodies_at(robot, robot.home, collision_bodies(robot))
+    poses = robot.links(robot.home)
+    for name in ("lwr_base", "lwr_link_3", "lwr_flange", "bh_base", "bh_thumb_link_3"):
+        assert any(link.endswith(name) for link in meshes.covered_links)
+    for link in meshes.covered_links:
+        hull = np.concatenate([part.mesh.points for part in meshes.by_link[link]])
+        solid = [body.surface.points for body in shapes if body.name == link]
+        drawn = hull @ poses[link][:3, :3].T + poses[link][:3, 3]
+        for bound in (np.min, np.max):
+            # Collision shapes enclose a link with an excess of up to 78 mm.
+            assert bound(drawn, axis=0) == pytest.approx(
+                bound(np.concatenate(solid), axis=0), abs=0.06
+            )
+
+
 def test_links_without_meshes_are_drawn_by_collision_shapes(site: Path) -> None:
     assert not list(site.iterdir())
-    robot = ik.load_robot("irb140+barrett_bh8_280")
+    robot = ik.load_robot("irb140+panda_hand")
     frames = [body.frame for body in visual_bodies(robot) if body.role != "pad"]
     assert {body.frame for body in collision_bodies(robot)} <= set(frames)
 

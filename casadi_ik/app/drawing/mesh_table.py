@@ -5,10 +5,11 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib import metadata
 from pathlib import Path
+from typing import Literal
 
 from msgspec import Struct
 
@@ -94,16 +95,44 @@ class VisualMeshEntry(Struct, frozen=True):
         return files or [self.file]
 
 
+class CircleEntry(Struct, frozen=True):
+    """A circle in the frame of a link.
+
+    Attributes:
+        xyz: Centre [m].
+        radius: Radius [m].
+        axis: Axis of the frame that the circle is perpendicular to.
+    """
+
+    xyz: tuple[float, float, float]
+    radius: float
+    axis: Literal["x", "y", "z"] = "z"
+
+
+class HullEntry(Struct, frozen=True):
+    """The convex hull of circles.
+
+    Attributes:
+        circles: Circles in the frame of the link.
+        color: Colour "#rrggbb".
+    """
+
+    circles: list[CircleEntry]
+    color: str
+
+
 class MeshTable(Struct, frozen=True):
     """The content of `models/viewer/visual_meshes.yaml`.
 
     Attributes:
         packages: Packages by their names on the index.
         robots: Descriptions by robot, the preferred one of a robot first.
+        hulls: Shapes by robot and link, for robots without a description on the machine.
     """
 
     packages: dict[str, PackageEntry]
     robots: dict[str, list[VisualMeshEntry]]
+    hulls: dict[str, dict[str, list[HullEntry]]] = {}
 
 
 def mesh_table() -> MeshTable:
@@ -140,12 +169,16 @@ def candidates(
     """Return the entries whose joints the robot has, with the prefix of the robot's names."""
     joints = {joint.name for joint in description.joints}
     for entry in entries:
-        first = entry.links[0]
-        for link in [name for name in description.links if name.endswith(first)]:
-            prefix = link.removesuffix(first)
-            has_joints = {prefix + name for name in entry.joints} <= joints
-            if has_joints and {prefix + name for name in entry.links} <= set(description.links):
+        for prefix in prefixes(description, entry.links):
+            if {prefix + name for name in entry.joints} <= joints:
                 yield entry, prefix
+
+
+def prefixes(description: RobotDescription, links: Sequence[str]) -> list[str]:
+    """Return the prefixes with which a robot has all the given links."""
+    names = set(description.links)
+    possible = [name.removesuffix(links[0]) for name in names if name.endswith(links[0])]
+    return sorted(prefix for prefix in possible if {prefix + link for link in links} <= names)
 
 
 def covered_links(description: RobotDescription, entry: VisualMeshEntry, prefix: str) -> set[str]:

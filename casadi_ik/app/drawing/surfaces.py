@@ -152,6 +152,11 @@ def join_surfaces(surfaces: Sequence[IndexedMesh]) -> IndexedMesh:
     return result
 
 
+def convex_hull(points: Array) -> IndexedMesh:
+    """Return the convex hull of points (n, 3)."""
+    return _from_trimesh(Trimesh(points).convex_hull)
+
+
 def split_sharp_edges(surface: IndexedMesh, degrees: float = 35.0) -> IndexedMesh:
     """Duplicate the points at sharp edges, as smooth shading requires.
 

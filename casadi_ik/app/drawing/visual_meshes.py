@@ -25,6 +25,7 @@ import numpy as np
 
 from casadi_ik.app.drawing import MESHES_VARIABLE, palette
 from casadi_ik.app.drawing.mesh_table import (
+    HullEntry,
     MeshFileEntry,
     MeshTable,
     VisualMeshEntry,
@@ -32,8 +33,9 @@ from casadi_ik.app.drawing.mesh_table import (
     covered_links,
     find_file,
     mesh_table,
+    prefixes,
 )
-from casadi_ik.app.drawing.surfaces import decimate, join_surfaces
+from casadi_ik.app.drawing.surfaces import SEGMENTS, convex_hull, decimate, join_surfaces
 from casadi_ik.compile import cache_directory
 from casadi_ik.errors import CasadiIKError
 from casadi_ik.files.arrays import Array
@@ -65,6 +67,13 @@ MAX_LINK_TRIANGLES = 4000
 
 DARKEST = 56
 """Smallest value of the brightest channel of a drawn colour, 0 to 255."""
+
+UPRIGHT = {"x": (0.0, np.pi / 2, 0.0), "y": (np.pi / 2, 0.0, 0.0), "z": (0.0, 0.0, 0.0)}
+"""Roll, pitch and yaw [rad] that rotate z to an axis, up to its sign."""
+
+ANGLES = np.linspace(0.0, 2 * np.pi, SEGMENTS, endpoint=False)
+UNIT_CIRCLE = np.column_stack([np.cos(ANGLES), np.sin(ANGLES)])
+"""(SEGMENTS, 2) Points of a circle."""
 
 MeshesByLink = Mapping[str, tuple[ColoredMesh, ...]]
 
@@ -169,7 +178,24 @@ def package_meshes(description: RobotDescription, table: MeshTable) -> VisualMes
                 by_link |= {link: parts for link, parts in meshes.items() if link in new_links}
                 covered |= new_links
                 origins.append((entry.package, entry.licence))
+    for hulls in table.hulls.values():
+        for prefix in prefixes(description, list(hulls)):
+            links = {prefix + link: entries for link, entries in hulls.items()}
+            if not covered & set(links):
+                by_link |= {link: tuple(map(hull_mesh, links[link])) for link in links}
+                covered |= set(links)
     return VisualMeshes(by_link, frozenset(covered), tuple(dict.fromkeys(origins)))
+
+
+def hull_mesh(entry: HullEntry) -> ColoredMesh:
+    """Return the convex hull of circles."""
+    points = [
+        frame_matrix(Frame(circle.xyz, UPRIGHT[circle.axis]))
+        @ np.array([circle.radius * x, circle.radius * y, 0.0, 1.0])
+        for circle in entry.circles
+        for x, y in UNIT_CIRCLE
+    ]
+    return ColoredMesh(convex_hull(np.array(points)[:, :3]), entry.color)
 
 
 def _entry_meshes(
