@@ -91,9 +91,11 @@ class FollowSources:
     def files(self) -> tuple[dict[str, str], dict[str, str]]:
         """Return the C file by path, and the substitutes of marks in other templates."""
         cycle = Cycle(self.robot.description, point_normal_kinds(len(self.robot.fingers)))
-        marks = {
-            "PREFIX": self.prefix,
+        prefix = {"PREFIX": self.prefix}
+        marks = prefix | {
             "GUARD": self.prefix.upper(),
+            "CLUTCH": render_template("clutch.c", prefix),
+            "RECOVERY": render_template("recovery.c", prefix),
             "CYCLE": standalone_source(row_major(cycle.graph.function), CodeOptions()),
             "FOLLOW_CONSTANTS": self._constants(cycle),
         }

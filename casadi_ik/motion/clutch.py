@@ -13,7 +13,7 @@ Poses = Mapping[str | None, Array]
 """Poses of palms (4, 4) by side; the side is None for a single arm-hand."""
 
 
-def turn_between(a: Array, b: Array) -> Array:
+def rotation_between(a: Array, b: Array) -> Array:
     """Return the smallest rotation (3, 3) that turns a unit vector a (3,) into b (3,)."""
     cosine, (x, y, z) = a @ b, np.cross(a, b)
     if cosine < -1 + 1e-12:
@@ -57,7 +57,7 @@ class Clutch:
             tip_points, tip_normals = self._robot.contacts(q)
             self._offsets[is_new_point] = (tip_points - points)[is_new_point]
             for i in np.flatnonzero(is_new_normal):
-                self._rotations[i] = turn_between(directions[i] / lengths[i], tip_normals[i])
+                self._rotations[i] = rotation_between(directions[i] / lengths[i], tip_normals[i])
         displaced_palms = dict[str | None, Array]()
         for side, pose in palms.items():
             if side not in self._palms:

@@ -191,12 +191,21 @@ enum {
   @GUARD@_MISSED = 3     /* no configuration on this branch meets the contacts */
 };
 
-/* Recovery of a follower that is stuck: a trail of postures that it has passed, and a line to one. */
+/* Recovery of a follower that is stuck: a trail of previous postures, and a line on which the motors
+ * return to its destination. */
 typedef struct {
-  double trail[@FOLLOW_TRAIL@][@GUARD@_MOTORS], start[@GUARD@_MOTORS], line[@GUARD@_MOTORS];
-  double least_since, least_ratio, longest_step, done, line_step, next_step, line_max_step, line_change;
-  int64_t count, cycles_to_check, check_cycles, patience, comparisons, cycles_stuck, candidate, destination;
-  int64_t is_returning, has_line, has_met;
+  double trail[@FOLLOW_TRAIL@][@GUARD@_MOTORS];
+  int64_t trail_length, cycles_until_check, min_check_cycles;
+  double longest_step; /* of any motor in a cycle, in the unit of the motor */
+  int64_t has_met_contacts;
+  double progress_ratio; /* error ratio at the last decrease of the error */
+  int64_t cycles_stuck, patience_cycles; /* cycles since then, and before postures are compared */
+  int64_t candidate, comparisons_per_cycle, destination; /* candidate and destination: rows of the trail */
+  double best_ratio; /* error ratio at the destination */
+  int64_t is_returning, has_line;
+  double line_start[@GUARD@_MOTORS], line[@GUARD@_MOTORS]; /* posture, and vector to the destination */
+  double fraction, fraction_step, next_fraction_step; /* of the line: so far, last cycle, next cycle */
+  double max_fraction_step, max_fraction_change;
 } @PREFIX@_recovery;
 
 /* A robot that follows moving contacts. Its results are q (positions of the motors at the end of the
@@ -209,9 +218,10 @@ typedef struct {
   double state[@FOLLOW_STATE@], new_state[@FOLLOW_STATE@];
   double parameters[@FOLLOW_PARAMETERS@], record[@FOLLOW_RECORD@];
   @PREFIX@_recovery recovery;
-  double offsets[@GUARD@_FINGERS][3], turns[@GUARD@_FINGERS][9], palm_offset[3], palm_turn[9];
-  int64_t has_offset[@GUARD@_FINGERS], has_turn[@GUARD@_FINGERS], has_palm;
-  int64_t is_paused, is_relative, is_beyond_limits;
+  double point_offsets[@GUARD@_FINGERS][3], normal_rotations[@GUARD@_FINGERS][9];
+  double palm_offset[3], palm_rotation[9];
+  int64_t has_point_offset[@GUARD@_FINGERS], has_normal_rotation[@GUARD@_FINGERS], has_palm_offset;
+  int64_t is_paused, displaces_targets, is_beyond_limits;
 } @PREFIX@_follower;
 
 /* Starts at rest at q0, or at home if that is a null pointer. period is the time between two cycles
