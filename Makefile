@@ -13,7 +13,7 @@ PAPER := $(BIN)/casadi-ik solve cup --method enhanced-dls --log $(OUT)/cup_paper
 SPHINX := $(BIN)/sphinx-build -E -q -W --keep-going -b html -c docs . out/docs \
   && $(BIN)/python docs/building/links.py out/docs
 
-.PHONY: help demo test test-all lint docs page bench notebooks clean
+.PHONY: help demo test test-all lint docs page pictures bench notebooks clean
 
 help:
 	@echo "make demo       set up and solve the grasp of a real object, by our method and the paper's"
@@ -22,6 +22,7 @@ help:
 	@echo "make lint       style, names, types, layers, documentation"
 	@echo "make docs       build the documentation site: out/docs/index.html"
 	@echo "make page       build the page that solves in the browser: out/page/index.html"
+	@echo "make pictures   draw the pictures of the documentation again"
 	@echo "make bench      timings on this machine"
 	@echo "make notebooks  execute the notebooks in place"
 	@echo "make clean      remove .venv and outputs"
@@ -73,6 +74,15 @@ docs: $(VENV)/dev.stamp
 # Needs node and npm, for three.js.
 page: $(VENV)/dev.stamp
 	$(BIN)/python page/build.py --out out/page
+
+# Robots are drawn with the visual meshes that are on the machine: `casadi-ik meshes` lists them.
+pictures: $(VENV)/dev.stamp page
+	$(BIN)/casadi-ik solve cup --scene table --picture docs/cup.png --picture-dark docs/cup_dark.png
+	$(BIN)/casadi-ik reach cup --scene table --animation docs/reach.gif
+	$(BIN)/python tools/doc_pictures.py --out docs
+	$(BIN)/python tools/viewer_pictures.py --out docs --page out/page/index.html
+	$(BIN)/python tools/hero.py --out docs
+	$(BIN)/python docs/building/figures.py
 
 # Where the other solvers are installed (pip install -r studies/peers.txt) they are measured too.
 bench: $(VENV)/dev.stamp

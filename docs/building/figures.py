@@ -290,8 +290,8 @@ def social() -> None:
     figure = plt.figure(figsize=(12, 6.3), dpi=100, facecolor="#161b22")
     picture = plt.imread(DOCS / "cup_dark.png")
     high, wide = picture.shape[:2]
-    axes = figure.add_axes((0.42, 0.03, 0.58, 0.74))
-    axes.imshow(picture[int(0.12 * high) : int(0.94 * high), int(0.552 * wide) :])
+    axes = figure.add_axes((0.37, 0.02, 0.62, 0.75))
+    axes.imshow(picture[int(0.12 * high) : int(0.94 * high), int(0.405 * wide) :])
     axes.axis("off")
     figure.text(0.05, 0.86, "casadi_ik", color="#e6edf3", fontsize=40, fontweight="bold")
     words = "Inverse kinematics for robot arms with multi-fingered hands"
