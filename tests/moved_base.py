@@ -6,20 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
-from casadi_ik.files.reading import roll_pitch_yaw
 
 IDENTITY = np.eye(4)
 
 
 def random_pose(rng: np.random.Generator) -> np.ndarray:
     """Return a pose (4, 4) with a uniform rotation and an origin within 1 m."""
-    pose, (w, *v) = np.eye(4), rng.normal(size=4)
-    v, size = np.array(v), np.sqrt(w * w + np.dot(v, v))
-    w, v = w / size, v / size
-    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    pose[:3, :3] = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(None, rng).as_matrix()
     pose[:3, 3] = rng.uniform(-1, 1, 3)
     return pose
 
@@ -88,4 +85,4 @@ def on_pedestal(
 
 def xyz_rpy(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the origin and the angles about fixed axes of a pose."""
-    return pose[:3, 3], np.asarray(roll_pitch_yaw(pose[:3, :3]))
+    return pose[:3, 3], Rotation.from_matrix(pose[:3, :3]).as_euler("xyz")

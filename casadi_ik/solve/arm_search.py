@@ -193,6 +193,7 @@ class ArmSearch:
         all_branches: bool = False,
         refine: bool = True,
         target_index: NDArray[np.intp] | None = None,
+        palms: Array | None = None,
     ) -> ArmCandidates:
         """Return the preferred collision-free arm of every hand that has one.
 
@@ -210,6 +211,8 @@ class ArmSearch:
             target_index: (k,) index of the target of each hand, in contiguous groups: after the
                 first hand with an arm the other hands of its target are skipped. None: no hand is
                 skipped.
+            palms: (k, 4, 4) palm poses, base frame, to which the arms in q do not belong. None: the
+                palm poses of q, whose arms are candidates too.
 
         Returns:
             The arms. With the preference "clearance" they have the largest clearance, and may be in
@@ -218,7 +221,11 @@ class ArmSearch:
         if not len(q):
             return ArmCandidates(q, np.zeros(0, np.intp), np.zeros(0, np.int64))
         arm_bounds = bounds[0][self._columns], bounds[1][self._columns]
-        problem = _ArmProblem(q, self._palm(q), starts, arm_bounds, prefer, query, surplus)
+        arm_palms = self._palms_in_arm_base(q, palms)
+        if palms is not None:
+            q = q.copy()
+            q[:, self._columns] = np.nan
+        problem = _ArmProblem(q, arm_palms, starts, arm_bounds, prefer, query, surplus)
         groups = self._family.rows + 1 if all_branches else 1
         measure = _Measure(self, prefer)
         entries = [self._run, self._arms.entry]
@@ -234,14 +241,15 @@ class ArmSearch:
         configurations[:, self._columns] = arms[hand_index, group]
         return ArmCandidates(configurations, hand_index, arms_tried)
 
-    def _palm(self, q: Array) -> Array:
-        """Return the (k, 4, 4) palm poses in the base frame of the arm."""
-        if self._side is None:
-            return self._robot.palm(q)
-        body = self._robot.description
+    def _palms_in_arm_base(self, q: Array, palms: Array | None) -> Array:
+        """Return (k, 4, 4) palm poses in the base frame of the arm; None: those of q."""
+        body, side = self._robot.description, self._side
+        if palms is None:
+            palms = self._robot.palm(q, None if side is None else body.sides[side].name)
+        if side is None:
+            return palms
         base = np.broadcast_to(self._robot.links(q)[body.trunk_link], (len(q), 4, 4))
-        palm = self._robot.palm(q, body.sides[self._side].name)
-        return np.asarray(np.linalg.solve(base, palm), dtype=float)
+        return np.asarray(np.linalg.solve(base, palms), dtype=float)
 
     def _choose_compiled(
         self,

@@ -81,8 +81,8 @@ class Questions:
 
     def choose(self) -> np.ndarray:
         """Return the answers of a choice among all grasps, in the grasps' order."""
-        ranked = self.solver.choose(self.grasps, q0=self.start[0], prefer="q0")
-        assert len(ranked) >= 5
+        ranked = self.solver.choose(self.grasps, q0=self.start[0], prefer="q0", apart=0)
+        assert len(ranked) == len(self.grasps)
         return np.array([choice.q for choice in sorted(ranked, key=lambda item: item.candidate)])
 
     def palms(self) -> np.ndarray:

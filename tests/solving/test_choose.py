@@ -250,3 +250,24 @@ def test_bad_choices_are_refused(solver, robot, candidates, cup):
         assert "\n" not in str(raised.value)
     with pytest.raises(errors.UnsupportedError, match=r"method: 'thumb-first'.*'hand-first'"):
         ik.Solver(robot, "thumb-first", compiled=False).choose(candidates, cup.object_pose)
+
+
+@pytest.mark.parametrize("name", ["ur5e+robotiq_2f85", "two_ur10e+panda_hand"])
+@pytest.mark.parametrize("prefer", ["q0", "limits"])
+def test_free_rotation_of_the_palm_is_searched(name, prefer):
+    """Opposed fingertips leave a rotation free; no rotation scores better than the choice."""
+    robot, rng = ik.load_robot(name), np.random.default_rng(2)
+    solver = ik.Solver(robot)
+    for q in robot.random(rng, 5):
+        start = np.clip(q + rng.uniform(-0.3, 0.3, len(q)), robot.lower, robot.upper)
+        points, normals = robot.contacts(q)
+        scores = []
+        for disturbance in (0.0, 1e-15):
+            moved_points = points + disturbance * rng.standard_normal(points.shape)
+            contacts = map(ik.Contact, moved_points, normals)
+            grasp = ik.Grasp(dict(zip(robot.fingers, contacts, strict=True)))
+            ranked = solver.choose([grasp], q0=start, prefer=prefer)
+            scores.append(ranked[0].score)
+        known_score = scored(robot, q[None], prefer, start)[0]
+        assert min(scores) >= known_score - 1e-3
+        assert np.ptp(scores) < 1e-3
