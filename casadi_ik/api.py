@@ -26,8 +26,8 @@ from casadi_ik.motion.moving import MovingSolver
 from casadi_ik.papers.qiu.step import FINGER_STEPS
 from casadi_ik.planning.choose import choose
 from casadi_ik.planning.object_pose import solve_with_object
+from casadi_ik.planning.reach.compute_map import reach_map
 from casadi_ik.planning.reach.place_base import place_base
-from casadi_ik.planning.reach.reach_map import reach_map
 from casadi_ik.planning.touch.grasps import grasps_of
 from casadi_ik.solve.alternatives import DEFAULT_SEPARATION
 from casadi_ik.solve.best_effort import BestEffort

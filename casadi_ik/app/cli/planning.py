@@ -30,6 +30,7 @@ from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.load_grasp import load_grasp
 from casadi_ik.planning.touch.found_grasps import FoundGrasps
 from casadi_ik.planning.touch.surface import load_surface
 from casadi_ik.solve.solution import Choice, Ranking
@@ -174,25 +175,32 @@ def grasps_npz(grasps: FoundGrasps, fingers: tuple[str, ...]) -> bytes:
     Option("--orientations N", "number of palm orientations", 32, opt.integer(1)),
     Option("--resolution M", "distance of neighbouring positions [m]", 0.05, opt.positive),
     Option("--meaning exact|tolerance", "palm pose itself, or within the solver's tolerance"),
+    Option("--contacts GRASP", "grasp of an object whose poses are mapped"),
+    opt.SCENE_FILE,
     opt.LIMIT_MODE,
     Option("--jobs N", "threads", 1, opt.integer(1)),
     opt.out_option("MAP.npz", "output file of the map", opt.file_name(".npz", ".ply", ".parquet")),
     opt.picture("--picture", "picture of three layers"),
 )
 def reach_map(args: Arguments) -> CommandResult:
-    """Map the palm poses that an arm can reach.
+    r"""Map the palm poses that an arm can reach, or the poses of an object.
 
     Examples:
       casadi-ik map ur5e --out ur5e.npz --picture ur5e.png
-      casadi-ik map panda --region 0.2 -0.4 0 0.8 0.4 0.6 --out panda.ply
+      casadi-ik map panda --scene table --resolution 0.1 --out panda.ply
       casadi-ik map my_robot.yaml --orientations 96 --jobs 4 --out my.parquet
+      casadi-ik map kuka_lwr_barrett --contacts cup --resolution 0.2 \
+          --orientations 8 --out cup.npz
 
     Every palm pose is REACHABLE (with joint positions as a witness, which forward
     kinematics confirms), UNREACHABLE (refuted by interval arithmetic) or OPEN. For an
     arm without an exact closed form, the solver searches for witnesses within its
-    tolerance, and nothing is refuted. Collisions are not considered.
+    tolerance, and nothing is refuted. With --scene, a palm pose that is reached only in
+    collision is COLLIDING. With --contacts, the cells are poses of the object of a grasp,
+    which arm and hand take together, within tolerance.
 
-    MAP.npz holds positions, rotations, code (0 OPEN, 1 REACHABLE, 2 UNREACHABLE) and q.
+    MAP.npz holds positions, rotations, code (0 OPEN, 1 REACHABLE, 2 UNREACHABLE,
+    3 COLLIDING) and q.
     MAP.ply is a point cloud of the positions, coloured by the share of reachable
     orientations. MAP.parquet has a row per palm pose.
 
@@ -207,8 +215,12 @@ def reach_map(args: Arguments) -> CommandResult:
             from casadi_ik.app.pictures import draw_reach_map as draw
     region = None if args.region is None else np.reshape(args.region, (2, 3))
     meaning = {"exact": "exact", "tolerance": "within tolerance"}.get(args.meaning)
-    reach = Solver(robot, limits=args.limits).reach_map(
-        region, args.orientations, args.resolution, meaning, jobs=args.jobs
+    contacts = None
+    if args.contacts is not None:
+        with located("--contacts"):
+            contacts = load_grasp(args.contacts)
+    reach = Solver(robot, limits=args.limits, scene=load_scene_arg(args)).reach_map(
+        region, args.orientations, args.resolution, meaning, jobs=args.jobs, contacts=contacts
     )
     save = {".npz": reach.save, ".ply": reach.to_ply, ".parquet": reach.to_parquet}
     with writing(args.out, "--out"):

@@ -45,6 +45,8 @@ class Reachability(IntEnum):
     """A configuration within limits reaches the palm pose; it is stored as the witness."""
     UNREACHABLE = 2
     """Interval bounds show that no configuration within limits reaches the palm pose."""
+    COLLIDING = 3
+    """Reached, but no collision-free configuration is found; only in maps with a scene."""
 
 
 class Meaning(StrEnum):
@@ -57,6 +59,8 @@ class Meaning(StrEnum):
     SAMPLED = "within tolerance, sampled"
     """Verdicts of the solver within its tolerance; nothing is UNREACHABLE, because the arm has no
     exact closed form."""
+    CONTACTS = "contacts within tolerance"
+    """Verdicts about object poses at which arm and hand take a grasp, as in `Status`."""
 
 
 @dataclass(frozen=True)
