@@ -67,7 +67,7 @@ COMMANDS = {
     "log finish": ("log.finish", "repair, in place, logs whose writer was killed"),
     "log merge": ("log.merge", "merge the shards of a study without recompression"),
     "view": ("view.view", "open the interactive viewer, or play a log"),
-    "meshes": ("meshes.meshes", "list or fetch visual meshes of robots"),
+    "meshes": ("lists.meshes", "list or fetch visual meshes of robots"),
     "completion": ("lists.completion", "print TAB completion for bash, zsh or fish"),
 }
 """Subcommand -> ("module.function" in this package, one-line summary)."""
