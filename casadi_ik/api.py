@@ -15,7 +15,7 @@ from casadi_ik.collision.clearance import Clearances, SceneCheck
 from casadi_ik.collision.scene import Scene, grasped_in
 from casadi_ik.compile.loop import Stepper
 from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.files.input_checks.poses import checked_pose, single_pose
+from casadi_ik.files.input_checks import checked_pose, single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs import Compression, Keep
 from casadi_ik.logs.writer import recorder_of

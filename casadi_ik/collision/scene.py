@@ -16,8 +16,7 @@ from casadi_ik.collision.scene_file import ObjectEntry, SceneFile, SolidEntry
 from casadi_ik.collision.solids import Kind, PosedSolid, object_solids
 from casadi_ik.errors import DescriptionError, InputError, UnknownNameError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import checked_mapping, warn_of_obstacle
-from casadi_ik.files.input_checks.poses import single_pose
+from casadi_ik.files.input_checks import checked_mapping, single_pose, warn_of_obstacle
 from casadi_ik.files.reading import read, validated
 from casadi_ik.files.shipped import resolve_description
 from casadi_ik.model.link_shapes import Touching

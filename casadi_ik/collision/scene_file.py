@@ -22,7 +22,7 @@ from casadi_ik.collision.solids import (
 )
 from casadi_ik.errors import DescriptionError, UnknownNameError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import (
+from casadi_ik.files.input_checks import (
     checked_quaternion,
     rotations_from_quaternions,
     single_pose,

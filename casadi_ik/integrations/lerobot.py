@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from casadi_ik.api import Solver
 from casadi_ik.errors import InputError, InvalidPoseError, optional_import
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
-from casadi_ik.files.input_checks.poses import single_pose
+from casadi_ik.files.input_checks import single_pose
+from casadi_ik.files.keypoints import lost_contacts_reason
 from casadi_ik.kinematics.arm_hand import load_robot
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.solve.status import Status

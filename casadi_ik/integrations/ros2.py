@@ -23,8 +23,8 @@ from numpy.typing import ArrayLike
 from casadi_ik.api import Solver
 from casadi_ik.errors import CasadiIKError, InputError, InvalidPoseError, optional_import
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
-from casadi_ik.files.input_checks.poses import unit_quaternions
+from casadi_ik.files.input_checks import unit_quaternions
+from casadi_ik.files.keypoints import lost_contacts_reason
 from casadi_ik.kinematics.arm_hand import load_robot
 from casadi_ik.logs.cdr import CdrReader, cdr, cdr_message
 from casadi_ik.logs.chunks import CDR_HEADER

@@ -13,8 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools, read_only
-from casadi_ik.files.input_checks.numbers import checked_mapping, warn_of_wide_tolerance
-from casadi_ik.files.input_checks.poses import MAX_SKEW, single_pose
+from casadi_ik.files.input_checks import (
+    MAX_SKEW,
+    checked_mapping,
+    single_pose,
+    warn_of_wide_tolerance,
+)
 from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.model.pose import Free, inverse
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError, optional_import
 from casadi_ik.files.arrays import Array, Bools
-from casadi_ik.files.input_checks.numbers import warn_of_large_mesh
+from casadi_ik.files.input_checks import warn_of_large_mesh
 from casadi_ik.files.limits import LIMITS, raise_hint, scaled_limit
 from casadi_ik.files.number_files import MESH_FORMATS, read_mesh
 from casadi_ik.model.sandbox import package_folders

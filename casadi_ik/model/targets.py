@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, RowError, UnknownNameError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import checked_mapping
-from casadi_ik.files.input_checks.poses import checked_pose
+from casadi_ik.files.input_checks import checked_mapping, checked_pose
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import (
     EXTRA_VECTORS,

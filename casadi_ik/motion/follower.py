@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from casadi_ik.collision.clearance_kernel import OBSTACLES
 from casadi_ik.errors import InputError, InvalidPoseError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
-from casadi_ik.files.input_checks.poses import single_pose
+from casadi_ik.files.input_checks import single_pose
+from casadi_ik.files.keypoints import lost_contacts_reason
 from casadi_ik.kinematics.contacts import Kinds, group_by_kinds, point_normal_kinds
 from casadi_ik.model.grasp import Grasp, real_array
 from casadi_ik.motion.clutch import Clutch, Poses

@@ -10,13 +10,13 @@ import numpy as np
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import KEYPOINTS, lost_contacts_reason
-from casadi_ik.files.input_checks.numbers import (
+from casadi_ik.files.input_checks import (
     MAX_FRAME_INTERVAL,
     MAX_WAYPOINT_INTERVAL,
     check_time_unit,
     cycle_count,
 )
+from casadi_ik.files.keypoints import KEYPOINTS, lost_contacts_reason
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import read_npz
 from casadi_ik.kinematics.arm_hand import ArmHand

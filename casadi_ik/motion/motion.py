@@ -14,7 +14,7 @@ from mcap.writer import Writer
 
 from casadi_ik.errors import InputError, optional_import
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import cycle_count
+from casadi_ik.files.input_checks import cycle_count
 from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import checked_integer
-from casadi_ik.files.input_checks.poses import single_pose
+from casadi_ik.files.input_checks import checked_integer, single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.grasp import Grasp

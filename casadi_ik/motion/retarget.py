@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import DescriptionError, InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import (
+from casadi_ik.files.keypoints import (
     KEYPOINTS,
     KNUCKLES,
     STANDARD_ORDER,

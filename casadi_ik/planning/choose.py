@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.collision.clearance import DISTANCE_ROUNDING, CollisionQuery
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array, Bools
-from casadi_ik.files.input_checks.poses import single_pose
+from casadi_ik.files.input_checks import single_pose
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.grasp import Grasp

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 
 from casadi_ik.errors import InputError, UnknownNameError
-from casadi_ik.files.input_checks.numbers import checked_mapping
+from casadi_ik.files.input_checks import checked_mapping
 from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.solve.hand_first.method import HandFirstMethod

@@ -16,8 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import check_contact_distances, warn_of_wide_tolerance
-from casadi_ik.files.input_checks.poses import checked_pose
+from casadi_ik.files.input_checks import (
+    check_contact_distances,
+    checked_pose,
+    warn_of_wide_tolerance,
+)
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance

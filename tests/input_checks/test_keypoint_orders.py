@@ -13,7 +13,7 @@ from made_up_hand import hand
 
 import casadi_ik as ik
 from casadi_ik.errors import InputWarning
-from casadi_ik.files.input_checks.keypoints import (
+from casadi_ik.files.keypoints import (
     KEYPOINT_ORDERS,
     STANDARD_ORDER,
     recognise_order,

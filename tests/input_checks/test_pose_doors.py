@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 import casadi_ik as ik
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import MAX_SKEW, checked_pose, matrix_skew
+from casadi_ik.files.input_checks import MAX_SKEW, checked_pose, matrix_skew
 from casadi_ik.papers.chandra.calibration import read_measurements
 
 POINT = np.array([0.4, 0.1, 0.3])

@@ -26,7 +26,7 @@ from casadi_ik.app.cli.table import Arguments, CommandResult, command
 from casadi_ik.app.report import Units, fields, files, headline
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.keypoints import lost_contacts_reason
+from casadi_ik.files.keypoints import lost_contacts_reason
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.motion.follower import FollowStatus
 from casadi_ik.motion.frames import Frames, follow_frames, read_frames

@@ -27,7 +27,7 @@ from casadi_ik.app.drawing.surfaces import join_surfaces, mesh_shape, split_shar
 from casadi_ik.app.viewer.request import OBJECT_ITEM, DraggableContact, PageRequest
 from casadi_ik.collision.clearance import ClosestPoints
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import rotations_from_quaternions
+from casadi_ik.files.input_checks import rotations_from_quaternions
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.solve.verdict import ContactVerdict
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, InvalidPoseError, UnsupportedError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import rotations_from_quaternions
+from casadi_ik.files.input_checks import rotations_from_quaternions
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import check_unpacked_size
 from casadi_ik.files.reading import Frame, Point, Struct, frame_matrix, read

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array, Bools
-from casadi_ik.files.input_checks.poses import nearest_rotations, rotation_problem
+from casadi_ik.files.input_checks import nearest_rotations, rotation_problem
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.joints import joint_motion, link_poses

@@ -10,7 +10,7 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, os_errors
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import rotations_from_quaternions
+from casadi_ik.files.input_checks import rotations_from_quaternions
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import check_unpacked_size, read_npz
 from casadi_ik.integrations.datasets.postures import HandPoses, rotations_from_rpy

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import warn_of_large_mesh
+from casadi_ik.files.input_checks import warn_of_large_mesh
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.number_files import hex_color, read_mesh_parts
 from casadi_ik.model.sandbox import package_folders

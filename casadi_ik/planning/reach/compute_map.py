@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array, Bools, spread_points
-from casadi_ik.files.input_checks.poses import checked_pose, checked_rotations
+from casadi_ik.files.input_checks import checked_pose, checked_rotations
 from casadi_ik.files.progress import progress
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import describe_arm

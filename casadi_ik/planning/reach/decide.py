@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.files.arrays import Array, Bools, Rows, spread_points
-from casadi_ik.files.input_checks.poses import rotations_from_quaternions
+from casadi_ik.files.input_checks import rotations_from_quaternions
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.family import ClosedForm
 from casadi_ik.kinematics.arms.recognise import arm_family

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from casadi_ik.errors import InputError, UnsupportedError
 from casadi_ik.files.arrays import Array, Rows, spread_points
-from casadi_ik.files.input_checks.poses import checked_pose
+from casadi_ik.files.input_checks import checked_pose
 from casadi_ik.kinematics.arms.recognise import describe_arm
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import Free

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
+from casadi_ik.files.input_checks import checked_integer, checked_number
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse

@@ -19,8 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import CasadiIKError, InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.numbers import checked_integer, checked_number
-from casadi_ik.files.input_checks.poses import single_pose
+from casadi_ik.files.input_checks import checked_integer, checked_number, single_pose
 from casadi_ik.files.progress import progress
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance

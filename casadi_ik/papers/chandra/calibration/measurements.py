@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from casadi_ik.compile import FunctionKernel
 from casadi_ik.errors import InputError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.input_checks.poses import checked_quaternion
+from casadi_ik.files.input_checks import checked_quaternion
 from casadi_ik.files.renamed_modules import warn_renamed
 from casadi_ik.kinematics import dual_quaternion as dq
 from casadi_ik.kinematics.screws import finger_chain
