@@ -144,9 +144,9 @@ def test_rolling_pads_beyond_reach_are_unreachable(name: str, offset: list[float
     robot = ik.load_robot(name)
     solver = ik.Solver(robot)
     q = robot.home[None]
-    near = rolling_targets(robot, q, np.random.default_rng(4))
-    balls, points = near.extra_vectors["balls"], near.points + offset
-    batch = solver.solve_batch(points, near.normals, balls=balls, diagnose=True)
+    reachable = rolling_targets(robot, q, np.random.default_rng(4))
+    balls, points = reachable.extra_vectors["balls"], reachable.points + offset
+    batch = solver.solve_batch(points, reachable.normals, balls=balls, diagnose=True)
     assert batch.status_names == ["UNREACHABLE"]
     grasp = ik.Grasp(
         {
