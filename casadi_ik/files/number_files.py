@@ -159,6 +159,9 @@ def read_mesh_parts(path: Path, location: str) -> list[MeshPart]:
             f"{location}: found {kind!r}, expected one of {', '.join(MESH_FORMATS)}"
         )
     data = read_bytes(path, location, scaled_limit(LIMITS.mesh_bytes), RAISE_HINT)
+    if not data or data.lstrip()[:20].lower().startswith(WEB_PAGE):
+        problem = "is a web page" if data else "has 0 bytes"
+        raise DescriptionError(f"{location}: the file {problem}; expected a mesh")
     try:
         parts = _parse_mesh(data, kind[1:])
     except MissingExtraError:
@@ -172,13 +175,30 @@ def read_mesh_parts(path: Path, location: str) -> list[MeshPart]:
         expected = f"at most {scaled_limit(LIMITS.mesh_faces)} {hint}"
         raise DescriptionError(f"{location}: found {count} triangles, expected {expected}")
     if not count:
-        raise DescriptionError(f"{location}: the mesh is empty; expected triangles")
+        is_cut = kind == ".stl" and len(data) < _stl_size(data)
+        problem = f": the file ends after {len(data)} of {_stl_size(data)} bytes" if is_cut else ""
+        raise DescriptionError(f"{location}: the mesh is empty{problem}; expected triangles")
     bound = LIMITS.mesh_coordinate
     if not all((np.abs(part.points) <= bound).all() for part in parts):
         raise DescriptionError(
             f"{location}: a vertex is not finite or beyond {bound:g}; expected finite coordinates"
         )
     return parts
+
+
+STL_HEADER, STL_FACE = 84, 50
+"""Sizes of the header of a binary STL file, which ends with the number of triangles, and of a
+triangle [bytes]."""
+
+WEB_PAGE = b"<!doctype html", b"<html"
+"""Starts of a web page, which a failed download leaves in place of a file."""
+
+
+def _stl_size(data: bytes) -> int:
+    """Return the size that the header of a binary STL file states [bytes]; 0 without a header."""
+    if len(data) < STL_HEADER:
+        return 0
+    return STL_HEADER + STL_FACE * int.from_bytes(data[STL_HEADER - 4 : STL_HEADER], "little")
 
 
 def _parse_mesh(data: bytes, kind: str) -> list[MeshPart]:
@@ -212,6 +232,8 @@ def _read_trimesh(data: bytes, kind: str) -> list[tuple[Any, Any, str]]:
     with optional_import("meshes"):
         import trimesh
 
+    if kind == "stl" and STL_HEADER < _stl_size(data) < len(data):
+        data = data[: _stl_size(data)]  # some programs append their own data
     library: Any = trimesh
     scene = library.load_scene(io.BytesIO(data), file_type=kind, process=False, skip_materials=True)
     return [(mesh.vertices, mesh.faces, "") for mesh in scene.dump() if hasattr(mesh, "faces")]

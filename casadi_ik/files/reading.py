@@ -61,6 +61,10 @@ class _UniqueKeyLoader(_SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+"""Start of the text that a checkout without Git LFS contains in place of a large file."""
+
+
 def read_bytes(path: Path, location: str, max_size: int, note: str = "") -> bytes:
     """Read a file.
 
@@ -71,7 +75,7 @@ def read_bytes(path: Path, location: str, max_size: int, note: str = "") -> byte
         note: Hint how to raise the limit, for the message.
 
     Raises:
-        DescriptionError: The file cannot be read, or is larger.
+        DescriptionError: The file cannot be read, is larger, or is a Git LFS pointer.
     """
     try:
         with path.open("rb") as stream:
@@ -82,6 +86,10 @@ def read_bytes(path: Path, location: str, max_size: int, note: str = "") -> byte
     if len(data) > max_size:
         size = f"{max_size / 2**20:.3g} MiB {note}".rstrip()
         raise DescriptionError(f"{location}: cannot be read: is larger than {size}")
+    if data.startswith(LFS_POINTER):
+        raise DescriptionError(
+            f"{location}: the file is a Git LFS pointer; expected its contents (run git lfs pull)"
+        )
     return data
 
 

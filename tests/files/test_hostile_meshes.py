@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import random
+import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from commands import main
 from processes import python
 
 import casadi_ik as ik
@@ -120,3 +122,47 @@ def test_oversized_meshes_are_refused(tmp_path: Path, monkeypatch: pytest.Monkey
             ik.load_scene(scene(path))
         assert "ball.ply" in str(caught.value)
         assert "CASADI_IK_LIMITS" in str(caught.value)
+
+
+def stl(count: int, triangles: int) -> bytes:
+    """Return a binary STL file of a tetrahedron, with the number of triangles that it states."""
+    faces = [CORNERS[list(face)] for face in ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))]
+    rows = [struct.pack("<12fH", 0, 0, 0, *np.ravel(face), 0) for face in faces[:triangles]]
+    return b"exported".ljust(80) + struct.pack("<I", count) + b"".join(rows)
+
+
+def test_bytes_after_the_triangles_of_an_stl_file_are_ignored(tmp_path: Path) -> None:
+    path = tmp_path / "part.stl"
+    path.write_bytes(stl(4, 4) + b"material: steel")
+    ((solid, pose),) = ik.load_scene(scene(path)).items["body"].parts
+    outside = (CORNERS / 100 - pose[:3, 3]) @ solid.planes[:, :3].T - solid.planes[:, 3]
+    np.testing.assert_allclose(np.sort(outside)[:, -3:], 0, atol=1e-7)  # each on three planes
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "problem"),
+    [
+        ("part.stl", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "LFS"),
+        ("part.obj", b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n", "LFS"),
+        ("part.stl", b"\n<!DOCTYPE html><html>404: Not Found</html>".ljust(200), "web page"),
+        ("part.stl", stl(1000, 4), "284 of 50084 bytes"),
+        ("part.ply", b"", "0 bytes"),
+    ],
+)
+def test_a_file_that_is_not_there_in_full(
+    tmp_path: Path, name: str, data: bytes, problem: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(ik.errors.DescriptionError, match=f"{name}.*{problem}"):
+        ik.load_scene(scene(path))
+
+
+def test_a_description_that_is_a_pointer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    assert main(["import", str(path), "--out", str(tmp_path / "robot.yaml")]) == 2
+    assert "robot.urdf: the file is a Git LFS pointer" in capsys.readouterr().err
+    assert not (tmp_path / "robot.yaml").exists()
