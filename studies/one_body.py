@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from one_body_peers import by_contacts, by_wrists
 from runner.figures import RESULTS
-from runner.parts import read_parts, run_parts
+from runner.parts import add_part_options, complete_parts
 from runner.report import (
     Metric,
     command,
@@ -512,23 +512,17 @@ def main(arguments: list[str] | None = None) -> None:
         "--searched", type=int, default=200, help="targets beside a random search; 0: none"
     )
     parser.add_argument("--peers", type=int, default=100, help="targets for other ways; 0: none")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin nothing after")
-    parser.add_argument("--parts", type=Path, default=Path("out/one_body"), help="results of parts")
-    parser.add_argument("--out", type=Path, default=RESULTS / "one_body")
+    add_part_options(parser, "one_body", RESULTS / "one_body")
     options = parser.parse_args(arguments)
-    all_cells, until = cells(options), time.monotonic() + 60 * options.minutes
-    run_parts(work_out, all_cells, options.parts, jobs=options.jobs, until=until)
-    done, codes = read_parts(options.parts, all_cells)
+    results = complete_parts(work_out, cells(options), options, "parts")
+    done = results.done
     table, metrics = misses(done)
     parts = [INTRODUCTION, markdown_table(MISSES, table)] if table else []
     for task, table in TABLES.items():
         rows = [row for cell, result in done if cell.task == task for row in result.get("rows", [])]
         parts += [table.title, markdown_table(table.heads, rows)] if rows else []
-    if len(done) < len(all_cells):
-        parts.append(f"Of {len(all_cells):,} parts {len(done):,} are done so far.")
-    run_by, code = command(__file__, arguments), {"one_body": codes}
+    parts += results.note
+    run_by, code = command(__file__, arguments), {"one_body": results.codes}
     result = main_result(done)
     publish("Several arms as one", result, parts, options.out, run_by, code, metrics)
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from runner.figures import RESULTS
-from runner.parts import read_parts, run_parts
+from runner.parts import add_part_options, complete_parts
 from runner.report import (
     Metric,
     command,
@@ -116,10 +116,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Published grasps, with an arm and a table.")
     parser.add_argument("data", type=Path, help="folder of NAME.npy and NAME.obj")
     parser.add_argument("--limit", type=int, default=100, help="grasps of an object at a pose")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--parts", type=Path, default=Path("out/public_grasps"))
-    parser.add_argument("--out", type=Path, default=RESULTS / "public_grasps")
+    add_part_options(parser, "public_grasps", RESULTS / "public_grasps")
     options = parser.parse_args(arguments)
     cells = [
         Cell(str(mesh), scale, pose, options.limit, options.seed)
@@ -127,8 +124,8 @@ def main(arguments: list[str] | None = None) -> None:
         for scale in SIZES
         for pose in range(len(POSES))
     ]
-    run_parts(solve, cells, options.parts, jobs=options.jobs, title="objects at poses")
-    done, codes = read_parts(options.parts, cells)
+    results = complete_parts(solve, cells, options, "objects at poses")
+    done = results.done
     rows, metrics = [], list[Metric]()
     for mesh in sorted({cell.mesh for cell, _ in done}):
         results_of_mesh = [result for cell, result in done if cell.mesh == mesh]
@@ -181,8 +178,8 @@ def main(arguments: list[str] | None = None) -> None:
             [[a, str(n)] for a, n in causes.most_common(12)],
         )
     ]
-    parts += ["## As published", PUBLISHED]
-    run_by, code = command(__file__, arguments), {"public grasps": codes}
+    parts += [*results.note, "## As published", PUBLISHED]
+    run_by, code = command(__file__, arguments), {"public grasps": results.codes}
     heading = "Published grasps with an arm and a table"
     publish(heading, result, parts, options.out, run_by, code, metrics)
 

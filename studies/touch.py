@@ -17,7 +17,6 @@ pybullet_data/random_urdfs, scaled by 0.015 as these files say.
 from __future__ import annotations
 
 import argparse
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from typing import Any
 
 import numpy as np
 from runner.figures import RESULTS
-from runner.parts import read_parts, run_parts
+from runner.parts import add_part_options, complete_parts
 from runner.report import (
     Metric,
     command,
@@ -194,17 +193,26 @@ def checked(
 
 
 def closes(points: np.ndarray, inward: np.ndarray, length: float) -> bool:
-    """Return whether soft contacts resist any small wrench, by a linear program.
+    """Return whether soft contacts resist any small wrench, see `closure_margin`."""
+    return closure_margin(points, inward, length) > 1e-9
+
+
+def closure_margin(
+    points: np.ndarray, inward: np.ndarray, length: float, edges: int = EDGES, turn: float = 0.0
+) -> float:
+    """Return the largest least share of all cone edges in balance; above 0 for force closure.
 
     Args:
-        points: (c, 3) from the middle of the object [m].
-        inward: (c, 3) normals into it.
-        length: By which torques are divided [m].
+        points: (c, 3) contacts from the reference point [m].
+        inward: (c, 3) unit normals into the object.
+        length: Length by which torques are divided [m].
+        edges: Edges of the polyhedral friction cone.
+        turn: Angle of the first edge, in steps between edges.
     """
     columns = []
     for point, normal in zip(points, inward, strict=True):
         across = np.linalg.svd(normal[None])[2][1:]
-        for angle in 2 * np.pi * np.arange(EDGES) / EDGES:
+        for angle in 2 * np.pi * (np.arange(edges) + turn) / edges:
             force = normal + MU * (np.cos(angle) * across[0] + np.sin(angle) * across[1])
             columns.append([*force, *np.cross(point, force) / length])
         for spin in (1, -1):
@@ -212,16 +220,15 @@ def closes(points: np.ndarray, inward: np.ndarray, length: float) -> bool:
             columns.append([*normal, *torque / length])
     wrenches = np.array(columns).T
     g = wrenches.shape[1]
-    if np.linalg.matrix_rank(wrenches) < 6:
-        return False
-    # The largest least share of all edges in balance: above 0 these surround the origin.
-    rows = np.concatenate([wrenches, np.zeros((6, 1))], axis=1)
-    balance = np.concatenate([rows, [[1.0] * g + [0.0]]])
+    if np.linalg.matrix_rank(wrenches, tol=1e-6) < 6:
+        return 0.0
+    balance = np.zeros((7, g + 1))
+    balance[:6, :g], balance[6, :g] = wrenches, 1.0
     lower = np.concatenate([-np.eye(g), np.ones((g, 1))], axis=1)
     cost = np.append(np.zeros(g), -1.0)
     bounds = [(0, None)] * g + [(None, None)]
-    done = linprog(cost, lower, np.zeros(g), balance, [0.0] * 6 + [1.0], bounds)
-    return bool(done.status == 0 and -done.fun > 1e-9)
+    program = linprog(cost, lower, np.zeros(g), balance, [0.0] * 6 + [1.0], bounds)
+    return float(-program.fun) if program.status == 0 else 0.0
 
 
 def cells(options: argparse.Namespace) -> list[Cell]:
@@ -281,17 +288,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--robots", nargs="+", default=ROBOTS)
     parser.add_argument("--objects", nargs="+", default=ik.shipped_names("objects"))
     parser.add_argument("--limit", type=int, default=100, help="grasps of an object at a pose")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin nothing after")
-    parser.add_argument("--parts", type=Path, default=Path("out/touch"), help="results of parts")
-    parser.add_argument("--out", type=Path, default=RESULTS / "touch", help="folder of the report")
+    add_part_options(parser, "touch", RESULTS / "touch")
     options = parser.parse_args(arguments)
-    all_cells, until = cells(options), time.monotonic() + 60 * options.minutes
-    run_parts(
-        solve, all_cells, options.parts, jobs=options.jobs, until=until, title="objects at poses"
-    )
-    done, codes = read_parts(options.parts, all_cells)
+    results = complete_parts(solve, cells(options), options, "objects at poses")
+    done = results.done
     metrics, rows = list[Metric](), []
     for robot in options.robots:
         robot_results = [result for cell, result in done if cell.robot == robot]
@@ -305,8 +305,7 @@ def main(arguments: list[str] | None = None) -> None:
     poses, failed = (sum(int(row[i]) for row in rows) for i in (1, 2))
     result = f"Grasps are found for {poses - failed:,} of {poses:,} object poses."
     parts = [INTRODUCTION.format(checked=CHECKED, **texts), markdown_table(heads, rows)]
-    if len(done) < len(all_cells):
-        parts.append(f"Of {len(all_cells):,} objects at poses {len(done):,} are done so far.")
+    parts += results.note
     reasons = list(causes(done))
     if reasons:
         table = markdown_table(
@@ -314,7 +313,7 @@ def main(arguments: list[str] | None = None) -> None:
         )
         parts += ["## None found", table]
     parts += ["## Discussion", DISCUSSION] if metrics else []
-    run_by, code = command(__file__, arguments), {"touch": codes}
+    run_by, code = command(__file__, arguments), {"touch": results.codes}
     publish("Grasps from meshes", result, parts, options.out, run_by, code, metrics)
 
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -22,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from runner.figures import RESULTS
-from runner.parts import read_parts, run_parts
+from runner.parts import add_part_options, complete_parts
 from runner.report import (
     Metric,
     command,
@@ -31,8 +30,8 @@ from runner.report import (
     publish,
     rate_metric,
 )
-from runner.study import robot_of, standing
-from scipy.optimize import linprog
+from runner.study import standing
+from touch import MU, closure_margin, solver_of
 
 import casadi_ik as ik
 
@@ -47,14 +46,8 @@ ROBOTS = (
     "ur10e+robotiq_2f85",
 )
 
-MU = 0.5
-"""Friction coefficient."""
-
-PATCH = 5e-3
-"""Radius of the contact patch of a soft fingertip [m]."""
-
-EDGES = 12
-"""Edges of the polyhedral friction cone."""
+EDGES, FIRST_EDGE = 12, 0.3
+"""Edges of the polyhedral friction cone, and angle of the first in steps between edges."""
 
 MAX_DISTANCE = 1.2e-3
 """Largest distance of a stated contact from the mesh [m]."""
@@ -181,12 +174,6 @@ class Cell:
 
 
 @cache
-def solver_of(robot: str) -> ik.Solver:
-    """Return the solver of a robot before the table."""
-    return ik.Solver(robot_of(robot), scene=ik.load_scene("table"))
-
-
-@cache
 def surface_of(mesh: str) -> tuple[ik.Surface, Any]:
     """Return the surface of a mesh and the mesh, read from a file of triangles alone."""
     path = Path(_folder().name) / f"{mesh}.stl"
@@ -277,7 +264,7 @@ def check(robot: ik.ArmHand, mesh: Any, pose: np.ndarray, grasp: Any) -> dict[st
         lean, cone = max(lean, leans.max()), max(cone, (sliding - MU * pressed).max())
     inward = -np.array([normals_of_contact[0] for normals_of_contact in stated_feet.normals])
     center, length = mesh.bounds.mean(axis=0), float(mesh.extents.max()) / 2
-    margin = closure_margin(stated_feet.point - center, inward, length)
+    margin = closure_margin(stated_feet.point - center, inward, length, EDGES, FIRST_EDGE)
     depth = link_depth(robot, mesh, back, grasp)
     return {
         "not closed": bool(grasp.load > 0 and margin <= 1e-9),
@@ -301,36 +288,6 @@ CLAIMS = ("not closed", "outside the cone", "leaning", "off", "deep")
 def radii_of(robot: ik.ArmHand) -> np.ndarray:
     """Return the radii (f,) of the fingertip pads [m], 0 for planes."""
     return np.array([robot.description.finger(name).radius for name in robot.fingers])
-
-
-def closure_margin(points: np.ndarray, inward: np.ndarray, length: float) -> float:
-    """Return the largest least share of all cone edges in balance; above 0 for force closure.
-
-    Args:
-        points: (c, 3) contacts from the reference point [m].
-        inward: (c, 3) unit normals into the object.
-        length: Length by which torques are divided [m].
-    """
-    columns = []
-    for point, normal in zip(points, inward, strict=True):
-        across = np.linalg.svd(normal[None])[2][1:]
-        for angle in 2 * np.pi * (np.arange(EDGES) + 0.3) / EDGES:
-            force = normal + MU * (np.cos(angle) * across[0] + np.sin(angle) * across[1])
-            columns.append([*force, *np.cross(point, force) / length])
-        for spin in (1, -1):
-            torque = np.cross(point, normal) + spin * 2 / 3 * MU * PATCH * normal
-            columns.append([*normal, *torque / length])
-    wrenches = np.array(columns).T
-    g = wrenches.shape[1]
-    if np.linalg.matrix_rank(wrenches, tol=1e-6) < 6:
-        return 0.0
-    balance = np.zeros((7, g + 1))
-    balance[:6, :g], balance[6, :g] = wrenches, 1.0
-    lower = np.concatenate([-np.eye(g), np.ones((g, 1))], axis=1)
-    cost = np.append(np.zeros(g), -1.0)
-    bounds = [(0, None)] * g + [(None, None)]
-    program = linprog(cost, lower, np.zeros(g), balance, [0.0] * 6 + [1.0], bounds)
-    return float(-program.fun) if program.status == 0 else 0.0
 
 
 def link_depth(robot: ik.ArmHand, mesh: Any, back: np.ndarray, grasp: Any) -> float:
@@ -418,30 +375,23 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--robots", nargs="+", default=ROBOTS)
     parser.add_argument("--meshes", nargs="+", default=list(MESHES), choices=list(MESHES))
     parser.add_argument("--limit", type=int, default=40, help="grasps per mesh and robot")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="start nothing after")
-    parser.add_argument("--parts", type=Path, default=Path("out/touch_claims"), help="results")
-    parser.add_argument("--out", type=Path, default=RESULTS / "touch_claims", help="report folder")
+    add_part_options(parser, "touch_claims", RESULTS / "touch_claims")
     options = parser.parse_args(arguments)
-    all_cells, until = cells(options), time.monotonic() + 60 * options.minutes
-    run_parts(solve, all_cells, options.parts, jobs=options.jobs, until=until, title="meshes")
-    done, codes = read_parts(options.parts, all_cells)
+    results = complete_parts(solve, cells(options), options, "meshes before robots")
+    done = results.done
     metrics, rows = list[Metric](), []
     for robot in options.robots:
-        results = [result for cell, result in done if cell.robot == robot]
-        if results:
-            rows.append(row_of(robot, results, metrics))
+        robot_results = [result for cell, result in done if cell.robot == robot]
+        if robot_results:
+            rows.append(row_of(robot, robot_results, metrics))
     heads = ["robot", "meshes", "grasps", *CLAIMS, "farthest contact [mm]"]
     sizes = {"meshes": len(options.meshes), "robots": len(options.robots)}
     checks = [check for _, result in done for check in result["violations"]]
     faulty = sum(any(check[claim] for claim in CLAIMS) for check in checks)
     result = f"{faulty or 'None'} of {len(checks):,} grasps violates a checked property."
     introduction = INTRODUCTION.format(limit=options.limit, **sizes)
-    parts = [introduction, markdown_table(heads, rows)]
-    if len(done) < len(all_cells):
-        parts.append(f"Of {len(all_cells):,} meshes before robots {len(done):,} are done so far.")
-    run_by, code = command(__file__, arguments), {"touch_claims": codes}
+    parts = [introduction, markdown_table(heads, rows), *results.note]
+    run_by, code = command(__file__, arguments), {"touch_claims": results.codes}
     heading = "Checked properties of grasps from meshes"
     publish(heading, result, parts, options.out, run_by, code, metrics)
 

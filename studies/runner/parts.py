@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import sys
@@ -10,9 +11,10 @@ import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import joblib
 from rich.console import Console
@@ -108,6 +110,51 @@ def read_parts(folder: Path, parts: Iterable[P]) -> tuple[list[tuple[P, dict[str
     stored = [json.loads((folder / part.path).read_text(encoding="utf-8")) for part in done_parts]
     codes = ", ".join(sorted({entry["code"] for entry in stored}))
     return [(part, entry["found"]) for part, entry in zip(done_parts, stored, strict=True)], codes
+
+
+def add_part_options(parser: argparse.ArgumentParser, name: str, report_folder: Path) -> None:
+    """Add the options of a study whose parts are stored in one folder and reported in another."""
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random numbers")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="start nothing after")
+    parser.add_argument("--parts", type=Path, default=Path("out") / name, help="results of parts")
+    parser.add_argument("--out", type=Path, default=report_folder, help="folder of the report")
+
+
+@dataclass(frozen=True)
+class PartResults(Generic[P]):
+    """Results of the parts that are complete.
+
+    Attributes:
+        done: Parts with their results.
+        codes: Versions of the code that made them.
+        note: Sentence on missing parts, as a list that is empty if all are complete.
+    """
+
+    done: list[tuple[P, dict[str, Any]]]
+    codes: str
+    note: list[str]
+
+
+def complete_parts(
+    solve: Callable[[P], dict[str, Any]],
+    parts: Sequence[P],
+    options: argparse.Namespace,
+    title: str = "targets",
+) -> PartResults[P]:
+    """Solve parts for the time that the options allow, and return all complete ones.
+
+    Args:
+        solve: See `run_parts`.
+        parts: All parts.
+        options: Values of the options that `add_part_options` adds.
+        title: Noun for the parts in the progress bar and in the note.
+    """
+    until = time.monotonic() + 60 * options.minutes
+    run_parts(solve, parts, options.parts, jobs=options.jobs, until=until, title=title)
+    done, codes = read_parts(options.parts, parts)
+    note = [f"Of {len(parts):,} {title} {len(done):,} are done so far."]
+    return PartResults(done, codes, note if len(done) < len(parts) else [])
 
 
 def keep(path: Path, content: str | bytes) -> None:

@@ -9,7 +9,6 @@ import pytest
 import trimesh
 
 import casadi_ik as ik
-from casadi_ik.model import load_object
 
 CAN = """<?xml version="1.0"?>
 <robot name="can">
@@ -49,25 +48,21 @@ def write_can(folder: Path, mesh: str = "meshes/can.stl") -> Path:
 @pytest.mark.parametrize("mesh", ["meshes/can.stl", "package://set/can/meshes/can.stl"])
 def test_the_visual_mesh_is_placed_and_scaled(tmp_path: Path, mesh: str) -> None:
     path = write_can(tmp_path, mesh)
-    body = load_object(path) if "package" not in mesh else None
-    if body is None:  # the package is not found: the mesh is looked for beside the URDF
+    if "package" in mesh:  # the package is not found: the mesh is looked for beside the URDF
         (tmp_path / "can").mkdir()
         (tmp_path / "meshes").rename(tmp_path / "can" / "meshes")
-        body = load_object(path)
-    points, _ = body.mesh()
-    assert points.min(axis=0) == pytest.approx([-0.033, -0.033, 0.05], abs=1e-4)
-    assert points.max(axis=0) == pytest.approx([0.033, 0.033, 0.15], abs=1e-4)
-    assert body.signed_distance([[0.1, 0.0, 0.1]]) == pytest.approx([0.067], abs=1e-3)
+    points = ik.load_surface(path).points
+    assert points.min(axis=0) == pytest.approx([-0.033, -0.033, 0.05], abs=1e-3)
+    assert points.max(axis=0) == pytest.approx([0.033, 0.033, 0.15], abs=1e-3)
 
 
 def test_links_and_simple_shapes_make_one_body(tmp_path: Path) -> None:
     (tmp_path / "mobility.urdf").write_text(DRAWER)
-    body = load_object(f"{tmp_path / 'mobility.urdf'}@0.5")
-    points, _ = body.mesh()
-    assert points[:, 2].max() == pytest.approx(0.025)
+    points = ik.load_surface(f"{tmp_path / 'mobility.urdf'}@0.5").points
+    assert points[:, 2].max() == pytest.approx(0.025, abs=1e-3)
     knob = points[points[:, 2] > 0.006]
     assert (knob.min(axis=0) + knob.max(axis=0)) / 2 == pytest.approx(
-        [0.025, 0.01, 0.025], abs=2e-3
+        [0.025, 0.01, 0.0155], abs=2e-3
     )
 
 
@@ -102,7 +97,8 @@ def test_a_urdf_is_an_object_everywhere(tmp_path: Path) -> None:
 def test_a_urdf_without_a_body_is_one_line(tmp_path: Path, text: str) -> None:
     path = write_can(tmp_path)
     path.write_text(text)
-    for load in (load_object, ik.load_surface):
+    solid = {"kind": "object", "object": str(path)}
+    for load in (ik.load_surface, lambda _: ik.Scene({"can": solid})):
         with pytest.raises(ik.errors.DescriptionError) as caught:
             load(path)
         assert "model.urdf" in str(caught.value)

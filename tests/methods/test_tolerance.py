@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 from robot_variants import with_fixed_motor
 from toy_robots import moved_targets
 
 import casadi_ik as ik
-from casadi_ik.compile.emitter import CodeOptions
-from casadi_ik.solve.registry import build_method
 
 
 @pytest.mark.parametrize("degrees", [10.0, 30.0])
@@ -85,12 +81,3 @@ def test_palms_of_an_arm_with_limits_are_solved_within_tolerance(robot):
     palms = displaced_palms(robot, q, tolerance, 0.8)
     batch = ik.Solver(robot, tolerance=tolerance).solve_palms(palms, q, diagnose=True)
     assert np.flatnonzero(~batch.success).tolist() == []
-
-
-def test_the_loop_has_a_queue_for_every_stage():
-    """The loop had twelve queues for every method, so that lanes mixed stages."""
-    body = ik.load_robot("two_pandas+allegro").description
-    method: Any = build_method("hand-first", body, {})
-    stages = method.graph.function
-    assert len(stages.functions) >= 12
-    assert f"#define STEP_STAGES ({len(stages.functions)})\n" in stages.source(CodeOptions())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import casadi as ca
 import numpy as np
 import pytest
 import yaml
@@ -10,8 +9,6 @@ from processes import MODELS
 from toy_robots import COUPLED_HAND, copy_shipped_robot, write_coupled_robot
 
 import casadi_ik as ik
-from casadi_ik.kinematics.couplings import follow
-from casadi_ik.model.couplings import FourBar, LeadScrew, Linear
 
 NARROW = {
     "left_spread": [-0.1, 0.5],
@@ -80,18 +77,6 @@ def test_shipped_robots_keep_their_exact_strokes():
         robot = ik.load_robot(name)
         np.testing.assert_array_equal(robot.lower, robot.description.actuator_limits[0])
         np.testing.assert_array_equal(robot.upper, robot.description.actuator_limits[1])
-
-
-def test_numbers_match_the_graphs(rng):
-    bar = FourBar("x", 0.0297, 0.0347, 0.0084, 0.0072, 3.32939008, 4.1110)
-    screw = LeadScrew("x", 0.0522, 0.013, 0.58)
-    for coupling, low, high in ((bar, -4, 4), (screw, 0.03, 0.07), (Linear("x", -0.5, 0.1), -1, 1)):
-        joint = type("Joint", (), {"coupling": coupling})()
-        q = ca.SX.sym("q")
-        graph = ca.Function("graph", [q], [follow(joint, q)])
-        values = rng.uniform(low, high, 500)
-        expected = np.array(graph(values[None])).ravel()
-        np.testing.assert_allclose(coupling.joint_position(values), expected, atol=1e-12)
 
 
 def test_non_monotonic_coupling_keeps_the_interval_of_home(tmp_path):

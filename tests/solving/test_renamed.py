@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.solve.registry import RENAMED_OPTIONS, build_method
 
 
-@pytest.mark.parametrize(("old", "new"), RENAMED_OPTIONS.items())
-def test_old_options_set_the_new_ones(robot: ik.ArmHand, old: str, new: str) -> None:
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("as_it_is", "max_cost_of_q0"),
+        ("eased", "damping_decrease"),
+        ("tightened", "damping_increase"),
+    ],
+)
+def test_old_options_set_the_new_ones(
+    robot: ik.ArmHand, tmp_path: Path, old: str, new: str
+) -> None:
     with pytest.warns(DeprecationWarning, match=old):
-        method = build_method("thumb-first", robot.description, {old: 0.25})
-    assert method.parameters[new] == 0.25
+        solver = ik.Solver(robot, "thumb-first", options={old: 0.25}, compiled=False)
+    solver.solve(ik.load_grasp("cup"), log=tmp_path / "cup.mcap", diagnose=False)
+    parameters = ik.logs.open(tmp_path / "cup.mcap").metadata["parameters"]
+    assert parameters["options"][new] == 0.25
+    assert old not in parameters["options"]
 
 
 def test_old_attributes_of_a_diagnosis(robot: ik.ArmHand) -> None:
