@@ -9,6 +9,7 @@ import textwrap
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from importlib import import_module
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
-from casadi_ik.files.lazy_import import import_lazily
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import describe_arm
 from casadi_ik.model.description import RobotDescription
@@ -186,7 +186,7 @@ def page_of(result: object) -> str:
     if robot is None or q is None or not np.isfinite(q).all():
         return text
     try:
-        image = import_lazily("casadi_ik.app.pictures.thumbnail").thumbnail(robot, q)
+        image = import_module("casadi_ik.app.pictures.thumbnail").thumbnail(robot, q)
     except ImportError:  # the extra is not installed
         return text
     source = f"data:image/png;base64,{b64encode(image).decode()}"

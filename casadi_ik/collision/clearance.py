@@ -16,7 +16,7 @@ from casadi_ik.collision.model import CollisionModel, check_base, collision_mode
 from casadi_ik.collision.scene import Scene
 from casadi_ik.collision.solids import PosedSolid, Solid, capsule
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import RecordReprMixin
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.link_shapes import Touching
 from casadi_ik.model.targets import TargetBatch

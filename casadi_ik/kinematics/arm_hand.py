@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from casadi_ik.errors import InputError, InputWarning
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import ReprMixin, import_lazily
+from casadi_ik.files.reprs import ReprMixin
 from casadi_ik.kinematics.robot_kernels import RobotKernels
 from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.grasp import real_array
@@ -407,7 +408,7 @@ class ArmHand(ReprMixin):
             MissingExtraError: viser is not installed.
             InputError: See `configuration`.
         """
-        return import_lazily("casadi_ik.app.viewer").view_grasp(
+        return import_module("casadi_ik.app.viewer").view_grasp(
             self, q=self.configuration(q), **options
         )
 

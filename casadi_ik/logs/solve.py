@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from casadi_ik.compile.layout import Field, Layout
 from casadi_ik.errors import LogError, UnknownNameError
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.renamed_modules import warn_renamed
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.events import Event
 from casadi_ik.logs.reader import Log

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.compile.layout import opaque
 from casadi_ik.errors import LogError, UnknownNameError, optional_import, os_errors
-from casadi_ik.files.lazy_import import RecordReprMixin
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.logs.events import MOVES, SINGULAR, Event, EventKind
 from casadi_ik.logs.traces import as_matrix, bits_of
 

@@ -14,7 +14,7 @@ from casadi_ik.collision.clearance import CollisionQuery
 from casadi_ik.collision.distances import gaps
 from casadi_ik.collision.scene import Scene
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import RecordReprMixin
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import point_normal_kinds
 from casadi_ik.model.targets import TargetBatch

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from casadi_ik.errors import InputError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks import cycle_count
-from casadi_ik.files.lazy_import import RecordReprMixin
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import JOINT_TRAJECTORY, cdr_message, ros_channel, write_postures

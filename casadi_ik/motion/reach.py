@@ -15,7 +15,7 @@ import numpy as np
 from casadi_ik.collision.clearance import CollisionQuery, SceneCheck
 from casadi_ik.collision.distances import gaps
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import RecordReprMixin
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.model.pose import inverse
 from casadi_ik.model.targets import TargetBatch

@@ -9,8 +9,8 @@ from enum import StrEnum
 from functools import cached_property
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import ReprMixin
 from casadi_ik.files.renamed_modules import warn_renamed
+from casadi_ik.files.reprs import ReprMixin
 from casadi_ik.model.targets import Tolerance
 from casadi_ik.solve.proofs.proof import Proof
 from casadi_ik.solve.verdict import ContactVerdict, PalmVerdict

@@ -23,7 +23,7 @@ import numpy as np
 from casadi_ik.compile import FunctionGraph, FunctionKernel
 from casadi_ik.compile.graphs import recipe
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import RecordReprMixin
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.kinematics.contact_fit import contact_residual
 from casadi_ik.kinematics.contacts import ContactRows, Kinds, kinds_suffix
 from casadi_ik.kinematics.forward import motor_scales

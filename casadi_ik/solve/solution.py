@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from importlib import import_module
 from itertools import chain
 from os import PathLike
 from typing import Any, Protocol, overload
@@ -13,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import RecordReprMixin, ReprMixin, import_lazily
 from casadi_ik.files.renamed_modules import warn_renamed
+from casadi_ik.files.reprs import RecordReprMixin, ReprMixin
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.model.grasp import Contact, Grasp, Tolerance
 from casadi_ik.solve.diagnosis import Diagnosis
@@ -223,7 +224,7 @@ class Solution(ReprMixin):
         if grasp is None:
             contacts = zip(robot.fingers, *robot.contacts(self.q), strict=True)
             grasp = Grasp({name: Contact(point, normal) for name, point, normal in contacts})
-        return import_lazily("casadi_ik.app.pictures").draw_solution(
+        return import_module("casadi_ik.app.pictures").draw_solution(
             robot, self, grasp, path, **options
         )
 

@@ -17,8 +17,8 @@ from casadi_ik.errors import (
     UnknownNameError,
 )
 from casadi_ik.files.arrays import Array
-from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.integrations.datasets.gripper_grasps import (
     GRIPPER_READERS,
     ISAAC_GRASP,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from casadi_ik.collision.distances import between_segments
 from casadi_ik.errors import optional_import
-from casadi_ik.files.arrays import Array
+from casadi_ik.files.arrays import Array, Rows
 from casadi_ik.files.progress import progress
 from casadi_ik.integrations.importing.capsules import SHAPE_FIT, fit_links
 from casadi_ik.integrations.importing.meshes import IndexedMesh, link_meshes
@@ -27,6 +27,21 @@ from casadi_ik.model.parts import HAND_PREFIX, RobotPart
 from casadi_ik.model.pose import inverse
 from casadi_ik.model.schema import ShapeEntry
 from casadi_ik.model.xml_tree import RobotTree
+
+with optional_import("shapes of imported links"):
+    from scipy.spatial import ConvexHull, QhullError
+
+Boxes = tuple[Array, Array]
+"""Centres and half edges (3, n) of axis-aligned boxes."""
+
+MAX_PAIRS = 4096
+"""Maximum number of pairs of boxes in one array operation; more do not fit into a core's cache."""
+
+MAX_HULL_STEPS = 30
+"""Maximum number of steps towards the nearest points of two convex hulls."""
+
+MIN_GAP = 1e-9
+"""Gap above which two convex hulls are regarded as separate, for rounding errors [m]."""
 
 
 def hand_links(robot: RobotDescription) -> frozenset[str]:
@@ -162,7 +177,7 @@ def _posed_capsules(entries: Sequence[ShapeEntry], poses: Array) -> PosedCapsule
     return PosedCapsules(segments, radii, rotations @ middle + origins, float(reach.max()))
 
 
-def _near_rows(centers: Array, other_centers: Array, distance: float) -> NDArray[np.intp]:
+def _near_rows(centers: Array, other_centers: Array, distance: float) -> Rows:
     """Return the rows of points (k, 3) whose distance is below a value [m]."""
     offsets = centers - other_centers
     return np.flatnonzero(np.einsum("ki,ki->k", offsets, offsets) < (distance + SPHERE_MARGIN) ** 2)
@@ -202,9 +217,7 @@ class MeshPair:
     links: tuple[str, str]
     poses: tuple[Array, Array]
 
-    def intersects(
-        self, configurations: NDArray[np.intp], stop_at_first: bool = False
-    ) -> NDArray[np.bool_]:
+    def intersects(self, configurations: Rows, stop_at_first: bool = False) -> NDArray[np.bool_]:
         """Return in which configurations the meshes intersect; see `CollisionTree.intersects`."""
         first, second = map(self.tree, self.links)
         pose, other_pose = (poses[configurations] for poses in self.poses)
@@ -308,23 +321,6 @@ def name_in_robot(name: str, names: tuple[str, ...], arm_names: set[str]) -> str
     """
     prefixed = HAND_PREFIX + name
     return prefixed if prefixed in names and name in arm_names else name
-
-
-with optional_import("shapes of imported links"):
-    from scipy.spatial import ConvexHull, QhullError
-
-Rows = NDArray[np.intp]
-Boxes = tuple[Array, Array]
-"""Centres and half edges (3, n) of axis-aligned boxes."""
-
-MAX_PAIRS = 4096
-"""Maximum number of pairs of boxes in one array operation; more do not fit into a core's cache."""
-
-MAX_HULL_STEPS = 30
-"""Maximum number of steps towards the nearest points of two convex hulls."""
-
-MIN_GAP = 1e-9
-"""Gap above which two convex hulls are regarded as separate, for rounding errors [m]."""
 
 
 class CollisionTree:

@@ -13,7 +13,7 @@ from casadi_ik.compile.function_kernel import machine_lanes
 from casadi_ik.compile.libraries import load_library
 from casadi_ik.errors import UnsupportedError
 from casadi_ik.files.arrays import Array, Bools
-from casadi_ik.files.lazy_import import RecordReprMixin
+from casadi_ik.files.reprs import RecordReprMixin
 
 
 @dataclass(frozen=True)

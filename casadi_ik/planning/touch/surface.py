@@ -18,8 +18,8 @@ from casadi_ik.compile.cache import trusted_cache, user_temp_dir
 from casadi_ik.errors import InputError, optional_import, os_errors
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.files.input_checks import checked_integer, checked_number
-from casadi_ik.files.lazy_import import RecordReprMixin
 from casadi_ik.files.renamed_modules import warn_renamed
+from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.files.writing import atomic_write
 from casadi_ik.model.mesh_shape import MeshShape
 from casadi_ik.model.objects import GraspObject, load_object

@@ -1,24 +1,15 @@
-"""Lazy imports of optional dependencies and of code that draws results."""
+"""Representations of results: text, HTML in notebooks, and short representations of records.
+
+The code that formats and draws results is imported by name when it is needed, so that results do
+not depend on it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
 from collections.abc import Mapping, Sequence
-from types import ModuleType
 from typing import Any
-
-
-def import_lazily(name: str) -> ModuleType:
-    """Import a module by name when it is needed.
-
-    Results import the code that draws them by name only, so that they do not depend on it.
-
-    Raises:
-        MissingExtraError: An optional dependency is not installed; the message says how to install
-            it.
-    """
-    return importlib.import_module(name)
 
 
 class ReprMixin:
@@ -31,11 +22,11 @@ class ReprMixin:
         return f"<{type(self).__name__} {str(self).partition(chr(10))[0]}>"
 
     def __str__(self) -> str:
-        reports: Any = import_lazily("casadi_ik.app.report")
+        reports: Any = importlib.import_module("casadi_ik.app.report")
         return str(reports.as_text(reports.report_of(self)))
 
     def _repr_html_(self) -> str:
-        reports: Any = import_lazily("casadi_ik.app.report")
+        reports: Any = importlib.import_module("casadi_ik.app.report")
         return str(reports.page_of(self))
 
 
