@@ -163,7 +163,7 @@ def solve(part: Part) -> dict[str, Any]:
     seconds = (time.process_time() - begin) / len(rows)
     distance = search.distances(targets, owner, batch.q[rows])
     reference = distance.copy()
-    candidates = [search.with_settings(THOROUGH).find(targets, home)]
+    candidates = [search.with_settings(THOROUGH).find(targets, home).q]
     first_rows = range(min(SINGLE_CALLS, len(rows)))
     singles = [targets.rows(slice(i, i + 1)) for i in first_rows]
     begin = time.process_time()

@@ -538,10 +538,12 @@ def group_by_kinds(
     if "balls" in names:
         has_ball = has_vector[..., names.index("balls")]
         has_ball |= has_ball.any(axis=1, keepdims=True) & np.isnan(targets.points[..., 0])
-    flags = has_vector.reshape(len(has_vector), -1)
-    _, first_rows, group = np.unique(
-        flags @ (1 << np.arange(flags.shape[1])), return_index=True, return_inverse=True
-    )
+    first_rows, group = np.zeros(1, dtype=np.intp), np.zeros(1, dtype=np.intp)
+    if len(has_vector) != 1:
+        flags = has_vector.reshape(len(has_vector), -1)
+        _, first_rows, group = np.unique(
+            flags @ (1 << np.arange(flags.shape[1])), return_index=True, return_inverse=True
+        )
     for i, finger_flags in enumerate(has_vector[first_rows].tolist()):
         kinds = tuple(
             kind_from_vectors(name[:-1] for name, flag in zip(names, row, strict=True) if flag)

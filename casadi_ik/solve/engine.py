@@ -24,6 +24,7 @@ from casadi_ik.model.targets import MANIPULABILITY, TargetBatch
 from casadi_ik.solve.alternatives import AlternativeFinder
 from casadi_ik.solve.batches import BatchParts, SolvedPart, judge_outcome, map_ordered
 from casadi_ik.solve.best_effort import BestEffort
+from casadi_ik.solve.best_effort_run import BestEffortRun
 from casadi_ik.solve.collision_free import RANKING_PREFERENCES, resolve_collisions, resolve_single
 from casadi_ik.solve.diagnosis import Diagnosis, Reason
 from casadi_ik.solve.diagnostician import Diagnostician
@@ -179,6 +180,11 @@ class Engine:
         return NearestSearch(SubproblemSolver(self.robot, method), kinds, self.compiled)
 
     @cached_property
+    def best_effort_run(self) -> BestEffortRun:
+        """Method followed by the search for the configurations nearest to unsolved targets."""
+        return BestEffortRun(self.robot, self.method, self.nearest_search)
+
+    @cached_property
     def _prepared_hand_search(self) -> HandSearch:
         """The method as a hand search, built and compiled.
 
@@ -233,8 +239,11 @@ class Engine:
             UnknownNameError: See `SolveOptions.check`.
         """
         options.check(self.robot)
-        if targets.extra_vectors and (engine := self.engine_for(targets)) is not self:
-            return engine.solve_one(targets, options)
+        engine = self.engine_for(targets) if targets.extra_vectors else self
+        return engine._solve_one_of_kind(targets, options)
+
+    def _solve_one_of_kind(self, targets: TargetBatch, options: SolveOptions) -> Solution:
+        """Solve one target of the contact kinds of this engine, see `solve_one`."""
         method, outcome = self.hand_search, None
         is_plain = targets.palms is None and targets.prefer not in RANKING_PREFERENCES
         if method is not None and is_plain and options.recorder is None:
@@ -243,14 +252,30 @@ class Engine:
                 return interim
             method = self._prepared_hand_search
             started = time.perf_counter()
-            single = method.solve_single(targets)
+            single = self._solve_single(method, targets, options)
             if single is not None:
                 if single.status == Status.SOLVED:
                     solution = self._single_solution(targets, single, started)
                     if solution is not None:
                         return solution
                 outcome = single.outcome(time.perf_counter() - started)
+                nearest = self._single_nearest(targets, outcome, options)
+                if nearest is not None:
+                    return nearest
         return self.solve(targets, options, outcome).solution(0)
+
+    def _solve_single(
+        self, method: HandSearch, targets: TargetBatch, options: SolveOptions
+    ) -> SingleOutcome | None:
+        """Solve one target; with `best_effort`, an unsolved one gets the first restarts only."""
+        run = self.best_effort_run if options.best_effort else None
+        first_targets = None if run is None else run.first_targets(targets)
+        if run is None or first_targets is None:
+            return method.solve_single(targets)
+        single = method.solve_single(first_targets, run.first_restarts)
+        if single is not None and single.status == Status.SOLVED and targets.prefers_q0:
+            return method.solve_single(targets)
+        return single
 
     def _single_solution(
         self, targets: TargetBatch, outcome: SingleOutcome, started: float
@@ -295,6 +320,29 @@ class Engine:
             arm_hand=robot,
         )
 
+    def _single_nearest(
+        self, targets: TargetBatch, outcome: Outcome, options: SolveOptions
+    ) -> Solution | None:
+        """Return the nearest configuration of a target out of reach; None: use `solve`.
+
+        Args:
+            targets: One target.
+            outcome: Outcome of the first restarts.
+            options: Options of the solve.
+        """
+        best_effort, robot = BestEffort.from_argument(options.best_effort), self.robot.description
+        if best_effort is None or options.diagnose:
+            return None
+        run, query = self.best_effort_run, self.collision_query(targets)
+        if run.first_targets(targets) is None:
+            return None
+        search_targets, solved = with_search_starts(robot, targets), np.zeros(1, dtype=bool)
+        outcome = run.end_early(search_targets, outcome, solved, query, best_effort)
+        if outcome.status[0] != Status.NEAREST:
+            return None
+        outcome = replace(outcome, q=in_nearest_turns(robot, targets, outcome.q))
+        return judge_outcome(self.robot, self.method.name, targets, outcome, query).solution(0)
+
     def solve(
         self, targets: TargetBatch, options: SolveOptions, outcome: Outcome | None = None
     ) -> BatchSolution:
@@ -312,11 +360,13 @@ class Engine:
         options.check(self.robot)
         if targets.palms is not None:
             _ = self._prepared_hand_search  # no other method keeps the hand of each target
-        recorder = options.recorder
+        recorder, best_effort = options.recorder, BestEffort.from_argument(options.best_effort)
         # Build before clock and threads start, so that no solve is charged for it.
         needs_finder = targets.prefer == MANIPULABILITY or self.check is not None
         for engine, _, _ in self.group_by_contact_kind(targets):
             engine.method.prepare()
+            if best_effort is not None:
+                _ = engine.best_effort_run
             if options.diagnose:
                 _ = engine.diagnostician
             if needs_finder and engine.hand_search is not None:
@@ -404,14 +454,20 @@ class Engine:
         trace = options.recorder is not None
         show_progress = options.show_progress and is_interactive()
         parts = BatchParts(len(targets), options.jobs, trace, show_progress)
+        best_effort = BestEffort.from_argument(options.best_effort)
 
         def solve(rows: slice) -> SolvedPart:
             started, part = time.time_ns(), targets.rows(rows)
             search_targets = with_search_starts(self.robot.description, part)
-            outcome = first_outcome or self._run(search_targets, trace)
+            query = self.collision_query(part)
+            if best_effort is not None:
+                outcome = self._run_best_effort(
+                    search_targets, query, best_effort, trace, first_outcome
+                )
+            else:
+                outcome = first_outcome or self._run(search_targets, trace)
             if outcome.rows is not None:
                 parts.adapt_to_memory(len(outcome.q), outcome.rows.nbytes)
-            query = self.collision_query(part)
             if query is None and targets.prefer == MANIPULABILITY:
                 outcome = self._maximise_manipulability(search_targets, outcome)
             batch = judge_outcome(self.robot, self.method.name, part, outcome, query)
@@ -434,8 +490,6 @@ class Engine:
                         part,
                         batch,
                     )
-            if (best_effort := BestEffort.from_argument(options.best_effort)) is not None:
-                batch = self._replace_by_nearest(search_targets, outcome, batch, query, best_effort)
             q = in_nearest_turns(self.robot.description, part, batch.q)
             batch = replace(batch, q=q)
             parts.adapt_to_time(1e-9 * (time.time_ns() - started))
@@ -443,46 +497,29 @@ class Engine:
 
         return map_ordered(solve, parts, options.jobs)
 
-    def _replace_by_nearest(
-        self,
-        targets: TargetBatch,
-        outcome: Outcome,
-        batch: BatchSolution,
-        query: CollisionQuery | None,
-        best_effort: BestEffort,
-    ) -> BatchSolution:
-        """Replace the configurations of unsolved targets by the nearest ones.
-
-        With a scene, targets for which only colliding configurations were found are unchanged.
-        """
-        started = time.perf_counter()
-        rows = np.flatnonzero(~batch.success & (batch.status != Status.COLLISION))
-        if not len(rows):
-            return batch
-        q, seconds = batch.q.copy(), batch.time.copy()
-        for engine, members, group in self.group_by_contact_kind(targets.rows(rows)):
-            members, search = rows[members], engine.nearest_search
-            group_query = None if query is None else query.rows(members)
-            q[members] = search.solve(group, q[members], group_query, best_effort)
-        if query is not None:
-            rows = rows[query.rows(rows).check(q[rows]).free]
-            q = np.where(np.isin(np.arange(len(q)), rows)[:, None], q, batch.q)
-        seconds[rows] += (time.perf_counter() - started) / max(len(rows), 1)
-        nearest = judge_outcome(
-            self.robot, self.method.name, targets, replace(outcome, q=q, time=seconds), query
-        )
-        status = batch.status.copy()
-        status[rows] = np.where(nearest.success[rows], int(Status.SOLVED), int(Status.NEAREST))
-        return replace(
-            nearest, status=status, diagnoses=batch.diagnoses, collisions=batch.collisions
-        )
-
     def _run(self, targets: TargetBatch, trace: bool) -> Outcome:
         """Run the method on targets of any contact kinds."""
         indices, outcomes = [], []
         for engine, rows, group in self.group_by_contact_kind(targets):
             indices.append(rows)
             outcomes.append(engine.method.run(group, trace))
+        return outcomes[0] if len(outcomes) == 1 else Outcome.interleaved(indices, outcomes)
+
+    def _run_best_effort(
+        self,
+        targets: TargetBatch,
+        query: CollisionQuery | None,
+        options: BestEffort,
+        trace: bool,
+        first_outcome: Outcome | None,
+    ) -> Outcome:
+        """Run the method on targets of any contact kinds, see `BestEffortRun.run`."""
+        indices, outcomes = [], []
+        for engine, rows, group in self.group_by_contact_kind(targets):
+            indices.append(rows)
+            group_query = None if query is None else query.rows(rows)
+            run = engine.best_effort_run
+            outcomes.append(run.run(group, group_query, options, trace, first_outcome))
         return outcomes[0] if len(outcomes) == 1 else Outcome.interleaved(indices, outcomes)
 
     def _maximise_manipulability(self, targets: TargetBatch, outcome: Outcome) -> Outcome:
@@ -532,6 +569,8 @@ class Engine:
         )
         status = batch.status.copy()
         for row, diagnosis in enumerate(diagnoses):
-            if diagnosis is not None and diagnosis.reason is not Reason.REACHABLE:
+            if diagnosis is None or diagnosis.reason is Reason.REACHABLE:
+                continue
+            if status[row] != Status.NEAREST:
                 status[row] = Status.UNREACHABLE if diagnosis.established else Status.NOT_FOUND
         return replace(batch, status=status, diagnoses=diagnoses)

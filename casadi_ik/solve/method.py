@@ -93,6 +93,25 @@ class Outcome:
             rows=records,
         )
 
+    def with_rows(self, rows: NDArray[np.intp], replacement: Outcome) -> Outcome:
+        """Return the outcome with the results (m,) of another run for some of its targets."""
+        is_unchanged = np.ones(len(self.q), dtype=bool)
+        is_unchanged[rows] = False
+        unchanged_rows = np.flatnonzero(is_unchanged)
+        if not len(unchanged_rows):
+            return replacement
+        trace = self.trace
+        unchanged = Outcome(
+            q=self.q[unchanged_rows],
+            status=self.status[unchanged_rows],
+            iterations=self.iterations[unchanged_rows],
+            restarts=self.restarts[unchanged_rows],
+            time=self.time[unchanged_rows],
+            phases={name: count[unchanged_rows] for name, count in self.phases.items()},
+            rows=np.concatenate([trace[row] for row in unchanged_rows]) if trace else None,
+        )
+        return Outcome.interleaved([unchanged_rows, rows], [unchanged, replacement])
+
     @classmethod
     def interleaved(
         cls, indices: Sequence[NDArray[np.intp]], outcomes: Sequence[Outcome]
@@ -353,7 +372,7 @@ class HandSearch(Method, Protocol):
         """Solve a batch with at most `rounds` restarts; see `Method.run`."""
         ...
 
-    def solve_single(self, targets: TargetBatch) -> SingleOutcome | None:
+    def solve_single(self, targets: TargetBatch, rounds: int | None = None) -> SingleOutcome | None:
         """Solve one target with less overhead than `run`; None if it cannot."""
         ...
 

@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import CollisionQuery
 from casadi_ik.compile.cancellation import SLICE, DriverCode, run_cancellable
@@ -23,7 +24,15 @@ from casadi_ik.compile.codegen import WIDE, c_struct, define, driver_text
 from casadi_ik.compile.function_kernel import machine_lanes, memory
 from casadi_ik.compile.graphs import recipe
 from casadi_ik.compile.libraries import load_library
-from casadi_ik.compile.loop import MIN_SOLVES_IN_LANES, NO_LIMIT, SLOTS, UNBEGUN, Job, LoopKernel
+from casadi_ik.compile.loop import (
+    MIN_BATCH_FOR_LANES,
+    MIN_SOLVES_IN_LANES,
+    NO_LIMIT,
+    SLOTS,
+    UNBEGUN,
+    Job,
+    LoopKernel,
+)
 from casadi_ik.files.arrays import Array, Rows, spread_points
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
@@ -106,6 +115,21 @@ def _load_search() -> Any:
     key = recipe("nearest_search", is_wide)
     library = load_library("nearest_search", lambda: _library_text(is_wide), SEARCH_SYMBOL, key)
     return None if library is None else library[SEARCH_SYMBOL]
+
+
+@dataclass(frozen=True, eq=False)
+class NearestMinima:
+    """Configurations nearest to k targets.
+
+    Attributes:
+        q: (k, n) configurations [rad or m].
+        mean_square: (k,) mean squares of their contact errors, each divided by its tolerance.
+        is_free: (k,) False where all minima of a target are in collision.
+    """
+
+    q: Array
+    mean_square: Array
+    is_free: NDArray[np.bool_]
 
 
 class SearchMemory:
@@ -234,17 +258,23 @@ class NearestSearch:
         last_q: Array,
         query: CollisionQuery | None,
         options: BestEffort,
-    ) -> Array:
-        """Return nearest configurations (k, n) as options require, see `find` [rad or m]."""
+    ) -> NearestMinima:
+        """Return nearest configurations as options require; for the arguments see `find`."""
         tolerances = options.tolerances(targets, self._trials.robot.fingers)
-        if options.local:
-            q = self.descend(targets, tolerances=tolerances)
+        if not options.local:
+            minima = self.find(targets, last_q, query, tolerances)
+            if not options.minimax:
+                return minima
+            q = minima.q
         else:
-            q = self.find(targets, last_q, query, tolerances)
-        if not options.minimax:
-            return q
-        descents = WeightedDescents(self, targets)
-        return find_closest(descents, np.arange(len(q)), q, 1, tolerances).minimax_q
+            q = self.descend(targets, tolerances=tolerances)
+        if options.minimax:
+            descents = WeightedDescents(self, targets)
+            q = find_closest(descents, np.arange(len(q)), q, 1, tolerances).minimax_q
+        is_free = np.ones(len(q), dtype=bool) if query is None else query.check(q).free
+        distances = self.distances(targets, np.arange(len(q)), q, tolerances)
+        counts = np.maximum((tolerances > 0).sum(axis=(1, 2)), 1)
+        return NearestMinima(q, distances / counts, is_free)
 
     def find(
         self,
@@ -252,8 +282,8 @@ class NearestSearch:
         last_q: Array,
         query: CollisionQuery | None = None,
         tolerances: Array | None = None,
-    ) -> Array:
-        """Return the nearest configurations found (k, n) [rad or m].
+    ) -> NearestMinima:
+        """Return the nearest configurations found.
 
         Args:
             targets: k targets of the kinds of contacts of this search; their starts decide between
@@ -265,13 +295,32 @@ class NearestSearch:
                 at tolerance.
         """
         q0 = np.ascontiguousarray(targets.starts(self._trials.robot.description))
+        if tolerances is None:
+            tolerances = residual_tolerances(targets)
         parameters = self.parameters(targets, UNLIMITED_STEP, tolerances)
         if self._entry is None:
-            return self._find_without_compiler(parameters, q0, last_q, query)
+            q, distances = self._find_without_compiler(parameters, q0, last_q, query)
+        else:
+            q, distances = self._find_compiled(targets, parameters, q0, last_q, query)
+        is_free = distances < IN_COLLISION
+        distances = np.where(is_free, distances, distances / IN_COLLISION - 1)
+        smallest = np.where(tolerances > 0, tolerances, np.inf).min(axis=(1, 2))
+        counts = np.maximum((tolerances > 0).sum(axis=(1, 2)), 1)
+        return NearestMinima(q, 2 * distances / (counts * smallest**2), is_free)
+
+    def _find_compiled(
+        self,
+        targets: TargetBatch,
+        parameters: Array,
+        q0: Array,
+        last_q: Array,
+        query: CollisionQuery | None,
+    ) -> tuple[Array, Array]:
+        """Return the nearest configurations (k, n) and their distances (k,)."""
         last_q = np.ascontiguousarray(last_q)
         lower, upper = targets.bounds(self._trials.robot.description)
         points, axes = self._seeds.rigid_hand(len(q0), lower, upper)
-        q = np.empty_like(q0)
+        q, distances = np.empty_like(q0), np.empty(len(q0))
         size = 1 if len(q0) == 1 else self._settings.chunk_size
         free_memory = self._free_memory.setdefault(size, [])
         try:
@@ -279,7 +328,7 @@ class NearestSearch:
         except IndexError:
             search = SearchMemory(self._seeds, self._step, self._settings, size)
         job, is_shared = search.job, len(points) == 1
-        job.lane_loop = self._loop_address(min(len(q0), size) * job.n_starts)
+        job.lane_loop = self._lane_loop_address
         job.scalar_loop = ctypes.cast(self._kernel.entry, ctypes.c_void_p).value
         for start in range(0, len(q0), size):
             rows = slice(start, start + size)
@@ -288,20 +337,27 @@ class NearestSearch:
             job.rigid_points, job.rigid_axes = memory(points[hand_rows]), memory(axes[hand_rows])
             job.parameters, job.q0 = memory(parameters[rows]), memory(q0[rows])
             job.last_q, job.q = memory(last_q[rows]), memory(q[rows])
+            job.distances = memory(distances[rows])
             job.last_stage = CHOICE_STAGE if query is None else FINISH_STAGE
             run_cancellable(self._step.graph.name, self._entry, job)
             if query is not None:
                 owner, states = search.descents(job.count)
-                distances = self._free_distances(query.rows(start + owner), states)
-                search.set_distances(job.count, distances)
+                weighted_distances = self._free_distances(query.rows(start + owner), states)
+                search.set_distances(job.count, weighted_distances)
                 job.last_stage = CHOICE_STAGE
                 run_cancellable(self._step.graph.name, self._entry, job)
         free_memory.append(search)
-        return q
+        return q, distances
 
-    def _loop_address(self, count: int) -> int | None:
-        """Return the address of the loop in lanes for a number of descents; None without one."""
-        loop = self._kernel.loop_for(count)
+    @property
+    def is_compiled(self) -> bool:
+        """True if the search runs in compiled code."""
+        return self._entry is not None
+
+    @cached_property
+    def _lane_loop_address(self) -> int | None:
+        """Address of the loop in lanes, which is several times as fast; None without lanes."""
+        loop = self._kernel.loop_for(MIN_BATCH_FOR_LANES)
         return None if loop is None else ctypes.cast(loop, ctypes.c_void_p).value
 
     def _free_distances(self, query: CollisionQuery, states: Array) -> Array:
@@ -316,8 +372,11 @@ class NearestSearch:
         q0: Array,
         last_q: Array,
         query: CollisionQuery | None,
-    ) -> Array:
-        """Return the nearest minimum to which q0, `last_q` and spread configurations descend."""
+    ) -> tuple[Array, Array]:
+        """Return the nearest minima of descents (k, n) and their distances (k,).
+
+        The descents begin at q0, `last_q` and spread configurations.
+        """
         robot, count = self._trials.robot, 2 + STARTS_WITHOUT_COMPILER
         samples = spread_points(STARTS_WITHOUT_COMPILER, len(robot.actuators))
         starts = np.empty((len(q0), count, len(robot.actuators)))
@@ -329,7 +388,8 @@ class NearestSearch:
         distances = self._distance(states)
         if query is not None:
             distances = self._free_distances(query.rows(owner), states)
-        return self._q(states)[smallest_per_owner(owner, distances, 1)]
+        nearest = smallest_per_owner(owner, distances, 1)
+        return self._q(states)[nearest], distances[nearest]
 
     def descend(
         self, targets: TargetBatch, is_local: bool = True, tolerances: Array | None = None
@@ -343,6 +403,8 @@ class NearestSearch:
         """
         q = targets.starts(self._trials.robot.description)
         max_step = DESCENT.local_step if is_local else UNLIMITED_STEP
+        if tolerances is None:
+            tolerances = residual_tolerances(targets)
         return self.descend_from(q, self.parameters(targets, max_step, tolerances))
 
     def descend_from(self, q: Array, parameters: Array) -> Array:
@@ -362,14 +424,12 @@ class NearestSearch:
         """The robot."""
         return self._trials.robot
 
-    def parameters(self, targets: TargetBatch, max_step: float, tolerances: Array | None) -> Array:
+    def parameters(self, targets: TargetBatch, max_step: float, tolerances: Array) -> Array:
         """Return the parameters (k, np) of the descent."""
         contacts = self._step.contacts
         vectors = {f"{name}s": targets.vectors(f"{name}s") for name in contacts.data}
         values = {name: np.where(np.isnan(array), 0.0, array) for name, array in vectors.items()}
         lower, upper = targets.bounds(self._trials.robot.description)
-        if tolerances is None:
-            tolerances = residual_tolerances(targets)
         bounds = {"weights": _weights(tolerances), "lower": lower, "upper": upper}
         return self._step.parameters.pack_rows(
             {**values, **bounds, "max_step": max_step}, len(targets)
@@ -392,10 +452,19 @@ class NearestSearch:
     def _distance(self, states: Array) -> Array:
         return states[:, self._step.state.slice("distance")].ravel()
 
-    def distances(self, targets: TargetBatch, owner: Rows, q: Array) -> Array:
-        """Return (m,) sums of squared contact errors, each divided by its tolerance."""
+    def distances(
+        self, targets: TargetBatch, owner: Rows, q: Array, tolerances: Array | None = None
+    ) -> Array:
+        """Return the sums (m,) of squared contact errors, each divided by its tolerance.
+
+        Args:
+            targets: k targets.
+            owner: (m,) target index of each configuration.
+            q: (m, n) configurations [rad or m].
+            tolerances: See `find`.
+        """
         misses = residual_norms(self._trials.robot, targets.rows(owner), q)
-        tolerances = residual_tolerances(targets)[owner]
+        tolerances = (residual_tolerances(targets) if tolerances is None else tolerances)[owner]
         ratios = np.divide(misses, tolerances, where=tolerances > 0, out=np.zeros_like(misses))
         return (ratios**2).sum(axis=(1, 2))
 
@@ -414,7 +483,9 @@ class WeightedDescents:
 
     @cached_property
     def _parameters(self) -> Array:
-        return self.search.parameters(self.targets, DESCENT.local_step, None)
+        return self.search.parameters(
+            self.targets, DESCENT.local_step, residual_tolerances(self.targets)
+        )
 
     def run(self, owner: Rows, q: Array, *, weights: Array) -> Array:
         """Return the local minima (m, n) to which configurations descend.

@@ -48,6 +48,74 @@ def test_no_other_optimiser_comes_nearer(name):
             assert nearest_distances[row] <= 2 * best.cost * (1 + 1e-6)
 
 
+def targets_near_the_boundary(robot, count, share_at_limits=0.4, seed=0):
+    """Return contacts with some motors at limits; every second target is moved by up to 5 mm."""
+    rng = np.random.default_rng(seed)
+    q = robot.random(rng, count)
+    limits = np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper)
+    q = np.where(rng.random(q.shape) < share_at_limits, limits, q)
+    points, normals = robot.contacts(q)
+    outwards = points / np.linalg.norm(points, axis=2, keepdims=True)
+    distance = np.where(np.arange(count) % 2, rng.random(count), 0.0)[:, None, None]
+    return points + 5e-3 * distance * outwards, normals
+
+
+@pytest.mark.parametrize(
+    ("name", "scene"),
+    [
+        ("so101", None),
+        ("ur5e", None),
+        ("barrett_bh8_280", None),
+        ("kuka_lwr_barrett", None),
+        ("kuka_lwr_barrett", "table"),
+    ],
+)
+def test_solved_targets_keep_their_solutions(name, scene):
+    robot = ik.load_robot(name)
+    scene = None if scene is None else ik.load_scene(scene)
+    solver = ik.Solver(robot, tolerance=ik.Tolerance(1e-3, np.radians(0.6)), scene=scene)
+    points, normals = targets_near_the_boundary(robot, 20, 0.4 if scene is None else 0.0)
+    options = {"q0": robot.home, "prefer": "q0" if scene is None else "limits"}
+    plain = solver.solve_batch(points, normals, **options)
+    best = solver.solve_batch(points, normals, best_effort=True, **options)
+    assert plain.success.any()
+    assert best.success[plain.success].all()
+    np.testing.assert_array_equal(best.q[plain.success], plain.q[plain.success])
+    for row in np.flatnonzero(plain.success)[:3].tolist():
+        contacts = zip(robot.fingers, points[row], normals[row], strict=True)
+        grasp = ik.Grasp({finger: ik.Contact(*vectors) for finger, *vectors in contacts})
+        single = solver.solve(grasp, diagnose=False, best_effort=True, **options)
+        np.testing.assert_array_equal(single.q, plain.q[row])
+
+
+@pytest.mark.parametrize("name", ["so101", "kuka_lwr_barrett"])
+def test_targets_out_of_reach_need_few_restarts(name):
+    robot = ik.load_robot(name)
+    solver = ik.Solver(robot)
+    points, normals = out_of_reach(robot, 10, factor=3.0)
+    plain = solver.solve_batch(points, normals)
+    nearest = solver.solve_batch(points, normals, best_effort=True)
+    rows = nearest.status == ik.Status.NEAREST
+    assert rows.any()
+    assert (nearest.iterations[rows] < plain.iterations[rows]).all()
+    contacts = zip(robot.fingers, points[rows][0], normals[rows][0], strict=True)
+    grasp = ik.Grasp({finger: ik.Contact(*vectors) for finger, *vectors in contacts})
+    single = solver.solve(grasp, diagnose=False, best_effort=True)
+    assert single.iterations == nearest.iterations[rows][0]
+
+
+def test_diagnosis_of_a_target_out_of_reach_is_kept(robot):
+    solver = ik.Solver(robot)
+    points, normals = out_of_reach(robot, 3, factor=3.0)
+    batch = solver.solve_batch(points, normals, best_effort=True, diagnose=True)
+    plain = solver.solve_batch(points, normals, diagnose=True)
+    assert (batch.status == ik.Status.NEAREST).all()
+    assert [item.reason for item in batch.diagnoses] == [item.reason for item in plain.diagnoses]
+    assert [item.established for item in batch.diagnoses] == [
+        item.established for item in plain.diagnoses
+    ]
+
+
 @pytest.mark.parametrize("name", ["viperx_300s", "ur5e", "kuka_lwr_barrett"])
 def test_single_targets_equal_those_of_a_batch(name):
     robot = ik.load_robot(name)

@@ -299,7 +299,7 @@ static void select_finalists(nearest_search_job *job, int64_t target) {
   while (count < job->n_finalists) finalists[count++] = -1;
 }
 
-/* Writes the nearest configuration of a target; the travel from q0 decides ties. */
+/* Writes the nearest configuration of a target and its distance; the travel from q0 decides ties. */
 static void choose(nearest_search_job *job, int64_t target) {
   const int64_t *finalists = job->finalists + target * job->n_finalists;
   int64_t length = 0, i;
@@ -309,6 +309,7 @@ static void choose(nearest_search_job *job, int64_t target) {
   i = nearest_tied(job, job->sorted, length, job->tie);
   memcpy(job->q + target * job->n_motors, job->states + i * job->n_state + job->state_q,
          (size_t) job->n_motors * sizeof(scalar));
+  job->distances[target] = job->states[i * job->n_state + job->state_distance];
 }
 
 /* Loads a descent into a slot of the loop, or stores its last state. */

@@ -31,6 +31,7 @@ typedef struct {
   int64_t *rows;               /* (max_sorted, 1 + n_groups) rows of the tables */
   int64_t *finalists;          /* (count, n_finalists) */
   scalar *q;                   /* (count, n_motors) result */
+  scalar *distances;           /* (count) distances of the result */
   loop_job *loop;              /* its pointers, slot count and slice are set */
   int (*lane_loop)(loop_job *job);     /* NULL: none */
   int (*scalar_loop)(loop_job *job);

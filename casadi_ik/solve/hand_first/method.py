@@ -287,17 +287,19 @@ class HandFirstMethod(LoopedMethod):
             self.graph.record.dtype if trace else None,
         )
 
-    def solve_single(self, targets: TargetBatch) -> SingleOutcome | None:
+    def solve_single(self, targets: TargetBatch, rounds: int | None = None) -> SingleOutcome | None:
         """Solve one target as `run` does, but faster; None: use `run`."""
         if not self.is_compiled or self._has_independent_sides:
             return None
+        max_restarts = self._max_restarts(targets)
         with self._searches.lent(targets.enforce_limits) as search:
             search.set_target(targets, 0, self.settings(targets))
-            status = search(self._max_restarts(targets))
+            status = search(max_restarts if rounds is None else min(max_restarts, rounds))
             if status is None:
                 return None
             outcome, has_verdict = search.result(status), not search.extra_vectors
-        if not has_verdict:
+        may_be_solved = rounds is None or status == Status.SOLVED
+        if may_be_solved and not has_verdict:
             self._judge(targets, outcome)
         return outcome
 
