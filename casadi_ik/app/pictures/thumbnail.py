@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import lru_cache
 from io import BytesIO
 
 import numpy as np
@@ -18,8 +20,9 @@ from casadi_ik.app.drawing.drawables import (
     overview,
     palm_positions,
     view_axes,
+    visual_bodies,
 )
-from casadi_ik.app.drawing.surfaces import decimate
+from casadi_ik.app.drawing.surfaces import decimate, mesh_shape
 from casadi_ik.files.arrays import Array
 from casadi_ik.kinematics.arm_hand import ArmHand
 
@@ -40,7 +43,7 @@ def thumbnail(robot: ArmHand, q: Array, inches: float = 2.6) -> bytes:
     """
     close_up = close_view(robot, q)
     palm = palm_positions(robot, q).mean(axis=0)
-    bodies = bodies_at(robot, q)
+    bodies = bodies_at(robot, q, _coarse_bodies(robot))
     hand = [body for body in bodies if body.role in ("hand", "pad")]
     figure = Figure((2 * inches, inches), dpi=100)
     FigureCanvasAgg(figure)
@@ -56,11 +59,20 @@ def thumbnail(robot: ArmHand, q: Array, inches: float = 2.6) -> bytes:
     return stream.getvalue()
 
 
+@lru_cache(maxsize=4)
+def _coarse_bodies(robot: ArmHand) -> list[Drawable]:
+    """Return the visual geometry with few triangles, in the frames of the links."""
+    return [
+        replace(body, shape=mesh_shape(decimate(body.surface, MAX_TRIANGLES)))
+        for body in visual_bodies(robot)
+    ]
+
+
 def _draw(axes: Axes, drawables: list[Drawable], view: Array) -> None:
     """Draw triangles from back to front without those that face away."""
     corners, colors = [], []
     for drawable in drawables:
-        surface = decimate(drawable.surface, MAX_TRIANGLES)
+        surface = drawable.surface
         triangles = (surface.points @ view.T)[surface.triangles]
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         length = np.linalg.norm(normals, axis=1)
