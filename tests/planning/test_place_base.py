@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from collision_queries import query_at
 from commands import main
 
 import casadi_ik as ik
@@ -45,6 +46,51 @@ def test_a_bound_below_the_number_of_palms_is_proved(solver, palms):
     assert place.count <= place.upper_bound < len(far)
 
 
+def test_base_and_arms_are_free_of_collision(solver, palms):
+    robot = solver.robot
+    size, center = [1.0, 1.0, 1.0], [0.5, -0.1, -0.3]
+    scene = ik.Scene({"block": {"kind": "box", "size": size, "xyz": center}})
+    free = solver.place_base(palms, BOX, resolution=0.3, prefer="center")
+    place = solver.place_base(palms, BOX, resolution=0.3, scene=scene)
+    assert 0 < place.count <= free.count <= place.upper_bound
+    # The base is not within the block; palm poses and the block are in the world frame.
+    assert (np.abs(place.base[:2] - center[:2]) > 0.5).any()
+    block = np.eye(4)
+    block[:3, 3] = center
+    enclosing = ik.Scene({"block": {"kind": "box", "size": [9, 9, 9], "xyz": center}})
+    with pytest.raises(ik.errors.InputError, match="scene"):
+        solver.place_base(palms[:2], np.zeros((2, 3)), scene=enclosing)
+    seen = ik.Solver(robot, scene=scene.moved("block", np.linalg.inv(place.pose) @ block))
+    assert query_at(seen, robot.home).free(place.q[place.reached]).all()
+    assert np.allclose(place.pose @ robot.palm(place.q[place.reached]), palms[place.reached])
+
+
+def test_a_preference_decides_among_equal_bases(solver, palms):
+    few, robot = palms[:5], solver.robot
+
+    def margin(place):
+        limits = np.minimum(place.q - robot.lower, robot.upper - place.q)
+        return (limits / (robot.upper - robot.lower)).min(axis=1).mean()
+
+    plain, limits, center = (
+        solver.place_base(few, BOX, resolution=0.3, prefer=prefer)
+        for prefer in (None, "limits", "center")
+    )
+    assert plain.count == limits.count == center.count == 5
+    assert margin(limits) > margin(plain)
+    assert np.linalg.norm(center.base[:3]) <= np.linalg.norm(plain.base[:3])
+    assert len(plain.bases_reaching(5)) > 0
+    with pytest.raises(ik.errors.InputError, match="prefer"):
+        solver.place_base(few, BOX, prefer="speed")
+
+
+def test_grasps_have_a_palm_pose_by_their_contacts():
+    solver = ik.Solver(ik.load_robot("kuka_lwr_barrett"))
+    cup = ik.load_grasp("cup")
+    place = solver.place_base([cup], ([-0.3, -0.3, 0], [0.3, 0.3, 0]), resolution=0.3)
+    assert place.count == 1
+
+
 def test_the_command_writes_the_placement(palms, tmp_path):
     np.savez(tmp_path / "palms.npz", palms=palms[:10])
     out = tmp_path / "place.json"
@@ -55,6 +101,11 @@ def test_the_command_writes_the_placement(palms, tmp_path):
     assert code == 0
     data = json.loads(out.read_text())
     assert data["count"] == sum(data["reached"]) <= data["upper_bound"] <= 10
+    # Without a region, and with configurations instead of palm poses.
+    np.savez(tmp_path / "found.npz", q=ik.load_robot("ur5e").random(np.random.default_rng(0), 4))
+    found = [str(tmp_path / "found.npz"), "--robot", "ur5e", "--resolution", "0.5"]
+    assert main(["place-base", *found, "--out", str(out)]) == 0
+    assert json.loads(out.read_text())["count"] == 4
 
 
 @pytest.mark.parametrize(
@@ -64,7 +115,7 @@ def test_the_command_writes_the_placement(palms, tmp_path):
         (np.eye(4)[None], ([1, 0, 0], [0, 0, 0]), "region"),
         (np.eye(4)[None], [1, 2], "region"),
         (np.eye(4), BOX, "grasps"),
-        ([ik.load_grasp("cup")], BOX, "grasps"),
+        ([np.eye(4), ik.load_grasp("cup")], BOX, "grasps"),
     ],
 )
 def test_bad_input_is_refused(solver, grasps, region, name):

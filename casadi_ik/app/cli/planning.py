@@ -29,7 +29,9 @@ from casadi_ik.app.report import fields, files, headline, table
 from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import InputError, MissingExtraError
 from casadi_ik.files.arrays import Array
+from casadi_ik.integrations.datasets import load_candidates
 from casadi_ik.kinematics.arm_hand import ArmHand
+from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.load_grasp import load_grasp
 from casadi_ik.planning.touch.found_grasps import FoundGrasps
 from casadi_ik.planning.touch.surface import load_surface
@@ -233,16 +235,17 @@ def reach_map(args: Arguments) -> CommandResult:
 
 
 @command(
-    Option("PALMS", "file .npz with `palms` (k, 4, 4), or .npy, world frame"),
+    Option("GRASPS", "file of palm poses or grasps, see below"),
     opt.REQUIRED_ROBOT,
     Option(
         "--region VALUES...",
         "corners of the base positions: x y z x y z [m]",
         parse=lambda words: opt.numbers(words, 6, "x y z x y z"),
-        required=True,
     ),
     Option("--resolution M", "size of the smallest boxes [m]", 0.02, opt.positive),
     Option("--max-time S", "time after which the search ends [s]", 10.0, opt.positive),
+    Option("--prefer limits|center", "preference among bases that reach equally many"),
+    opt.SCENE_FILE,
     opt.LIMIT_MODE,
     opt.out_option("PLACE.json", "output file of the placement"),
     opt.picture("--picture", "heat map of the bases"),
@@ -253,10 +256,17 @@ def place_base(args: Arguments) -> CommandResult:
     Examples:
       casadi-ik place-base palms.npz --robot ur5e --region -1 -1 0 1 1 0 \
           --out place.json
+      casadi-ik place-base grasps.yaml --robot kuka_lwr_barrett --scene table \
+          --out place.json
 
     The search is a branch and bound: the report has the number of palm poses that the
-    best base reaches, and a proved upper bound for all bases of the region. Collisions
-    are not considered.
+    best base reaches, and a proved upper bound for all bases of the region. With
+    --scene, base and arm are free of collision; the bound ignores collisions.
+
+    GRASPS is a file .npz with `palms` (k, 4, 4) or with `q` (k, n), as `grasp` and
+    `batch` write it, a file .npy of palm poses, or any file that `choose` reads; all in
+    the world frame. The default region is at height 0, around all bases that may reach
+    a palm pose.
 
     PLACE.json holds robot (its name), pose (4, 4), base (x, y, z [m], yaw [rad]), count,
     upper_bound, reached (k) and q (null where not reached).
@@ -265,15 +275,17 @@ def place_base(args: Arguments) -> CommandResult:
     """
     robot = load_robot_arg(args.robot)
     outputs = {"--out": args.out, "--picture": args.picture}
-    check_outputs(outputs, inputs=[Path(args.palms)])
+    check_outputs(outputs, inputs=[Path(args.grasps)])
     draw = None
     if args.picture is not None:
         with located("--picture", (MissingExtraError,)):
             from casadi_ik.app.pictures import draw_base_placement as draw
-    with located(args.palms):
-        palms = _read_palms(Path(args.palms))
-        placement = Solver(robot, limits=args.limits).place_base(
-            palms, np.reshape(args.region, (2, 3)), args.resolution, args.max_time
+    region = None if args.region is None else np.reshape(args.region, (2, 3))
+    solver, scene = Solver(robot, limits=args.limits), load_scene_arg(args)
+    with located(args.grasps):
+        grasps = _read_grasps(Path(args.grasps), robot)
+        placement = solver.place_base(
+            grasps, region, args.resolution, args.max_time, args.prefer, scene
         )
     rows = zip(placement.q.tolist(), placement.reached.tolist(), strict=True)
     data = {
@@ -291,7 +303,7 @@ def place_base(args: Arguments) -> CommandResult:
     x, y, z, yaw = placement.base.tolist()
     report = fields(
         {
-            "reached": f"{placement.count} of {len(palms)} palm poses",
+            "reached": f"{placement.count} of {len(placement.reached)} palm poses",
             "bound": f"{placement.upper_bound} (proved for all bases of the region)",
             "base": f"{x:.3f} {y:.3f} {z:.3f} m, yaw {yaw:.3f} rad",
         }
@@ -300,14 +312,22 @@ def place_base(args: Arguments) -> CommandResult:
     return CommandResult.of_parts(placement.count > 0, title, report, *files(outputs))
 
 
-def _read_palms(path: Path) -> Array:
-    """Return the palm poses (k, 4, 4) of a file.
+def _read_grasps(path: Path, robot: ArmHand) -> Array | tuple[Grasp, ...]:
+    """Return the palm poses (k, 4, 4) of a file, or its grasps.
 
     Raises:
-        InputError: The file cannot be read or has no palm poses.
+        InputError: The file cannot be read or has neither.
     """
-    try:
-        content = np.load(path, allow_pickle=False)
-        return content if isinstance(content, np.ndarray) else content["palms"]
-    except (OSError, KeyError, ValueError) as error:
-        raise InputError(f"palms: cannot be read: {error}; expected (k, 4, 4)") from error
+    if path.suffix in (".npz", ".npy"):
+        try:
+            content = np.load(path, allow_pickle=False)
+            if isinstance(content, np.ndarray):
+                return content
+            if "palms" in content:
+                return content["palms"]
+            if "q" in content:
+                q = content["q"]
+                return robot.palm(q[np.isfinite(q).all(axis=1)])
+        except (OSError, ValueError) as error:
+            raise InputError(f"palms: cannot be read: {error}; expected (k, 4, 4)") from error
+    return load_candidates(path, robot).grasps

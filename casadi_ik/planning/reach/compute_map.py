@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,7 +17,7 @@ from casadi_ik.files.progress import progress
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import describe_arm
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.model.pose import Free, inverse
+from casadi_ik.model.pose import Free
 from casadi_ik.planning.object_pose import place_targets
 from casadi_ik.planning.reach.decide import (
     REACH_PARAMETERS,
@@ -202,6 +203,12 @@ class PalmDecider:
         kind = Meaning.EXACT if self._is_exact else Meaning.WITHIN_TOLERANCE
         self.meaning = Meaning.SAMPLED if family is None else kind
 
+    def with_solver(self, solver: Any) -> PalmDecider:
+        """Return the decision with a solver that differs in the poses of its obstacles."""
+        decider = copy(self)
+        decider._solver = solver
+        return decider
+
     def decide(self, poses: Array) -> tuple[NDArray[np.int8], Array]:
         """Return verdicts (k,) about palm poses (k, 4, 4), and witnesses (k, joints) [rad]."""
         code = np.zeros(len(poses), dtype=np.int8)
@@ -275,12 +282,10 @@ class ObjectDecider:
                 f"meaning: found {meaning!r}, expected {Meaning.WITHIN_TOLERANCE!s}, which all "
                 "maps with contacts have"
             )
-        if contacts.object_pose is not None:
-            contacts = contacts.at(inverse(contacts.object_pose))
         self.meaning = Meaning.CONTACTS
         self.joints = len(solver.robot.actuators)
         self._solver = solver
-        self._target = solver._target_builder.from_grasps([contacts])
+        self._target = solver._target_builder.from_grasps([contacts.in_object_frame()])
 
     def decide(self, poses: Array) -> tuple[NDArray[np.int8], Array]:
         """Return verdicts (k,) about object poses (k, 4, 4), and witnesses (k, joints)."""

@@ -3,7 +3,9 @@
 Branch and bound over boxes of base poses: interval bounds of the margins count the palm poses that
 some base of a box may reach, an upper bound; the base in the middle of a box gives a lower bound.
 If the first joint of the arm is vertical, the yaw of the base only shifts this joint, so that the
-upper bound ignores yaw and the limits of the joint. A local search improves the best base.
+upper bound ignores yaw and the limits of the joint. A local search improves the best base. With a
+scene, the search excludes bases that touch an obstacle, and counts of the best bases and of the
+local search are those of collision-free arms; the upper bound ignores collisions.
 """
 
 from __future__ import annotations
@@ -17,13 +19,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from casadi_ik.errors import InputError, UnsupportedError
-from casadi_ik.files.arrays import Array, Rows, spread_points
+from casadi_ik.collision.scene import Scene
+from casadi_ik.errors import DescriptionError, InputError, UnsupportedError
+from casadi_ik.files.arrays import Array, Bools, Rows, spread_points
 from casadi_ik.files.input_checks import checked_pose
+from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.arms.recognise import describe_arm
 from casadi_ik.model.grasp import Grasp
-from casadi_ik.model.pose import Free
+from casadi_ik.model.pose import Free, inverse
 from casadi_ik.planning.object_pose import pose_matrices
+from casadi_ik.planning.reach.compute_map import PalmDecider, reachable_box, with_scene
 from casadi_ik.planning.reach.decide import (
     REACH_PARAMETERS,
     PalmReach,
@@ -32,6 +37,9 @@ from casadi_ik.planning.reach.decide import (
     redundancy_range,
 )
 from casadi_ik.planning.reach.margins import MarginKernels
+
+PREFERENCES = (None, "limits", "center")
+"""Criteria among bases that reach equally many palm poses."""
 
 VERTICAL_TOLERANCE = 1e-9
 """Deviation of a vertical first axis through the origin of the base [m and rad]."""
@@ -46,6 +54,8 @@ class PlacementParameters:
         yaws: Number of yaw angles at which a position is evaluated.
         samples: Number of samples of the redundancy parameter at which a base is evaluated.
         batch: Number of boxes that are bounded together.
+        scene_bases: Number of bases that are tried in search of one that touches no obstacle.
+        finalists: Maximum number of bases that are compared by collisions and preference.
         polish_steps: Initial steps of the local search: length [m] and yaw [rad].
         polish_end: Length of the last step [m].
         radian_length: Length that counts as much as a radian of yaw [m].
@@ -55,6 +65,8 @@ class PlacementParameters:
     yaws: int = 12
     samples: int = 12
     batch: int = 16
+    scene_bases: int = 64
+    finalists: int = 24
     polish_steps: tuple[float, float] = (0.05, 0.3)
     polish_end: float = 1e-3
     radian_length: float = 0.5
@@ -73,7 +85,7 @@ class BasePlacement:
         q: (k, a) witnesses of the arm [rad]; NaN for the other palm poses.
         upper_bound: Proved upper bound of the number of palm poses that any base reaches.
         bases: (m, 4) bases that were evaluated, for a heat map.
-        counts: (m,) number of palm poses that each of them reaches.
+        counts: (m,) number of palm poses that each of them reaches, without collisions.
         time: Duration [s].
 
     Example:
@@ -102,6 +114,10 @@ class BasePlacement:
         x, y, z, yaw = self.base.tolist()
         return pose_matrices(np.array([[x, y, z, 0.0, 0.0, yaw]]))[0]
 
+    def bases_reaching(self, count: int) -> Array:
+        """Return the bases (m, 4) among `bases` that reach at least this many palm poses."""
+        return self.bases[self.counts >= count]
+
     def __repr__(self) -> str:
         return (
             f"<BasePlacement reaches {self.count} of {len(self.reached)} palm poses, "
@@ -112,26 +128,33 @@ class BasePlacement:
 def place_base(
     solver: Any,
     grasps: ArrayLike | Sequence[Grasp],
-    region: Free | ArrayLike,
+    region: Free | ArrayLike | None = None,
     resolution: float = 0.02,
     max_time: float = 10.0,
+    prefer: str | None = None,
+    scene: Scene | None = None,
 ) -> BasePlacement:
     """Return the upright base pose from which the arm reaches most palm poses exactly.
 
-    Collisions are not considered.
-
     Args:
         solver: A `Solver`.
-        grasps: Palm poses (k, 4, 4) in the world frame, or grasps with palm poses.
+        grasps: Palm poses (k, 4, 4) in the world frame, or grasps. A grasp without a palm pose is
+            represented by one palm pose from which the hand meets its contacts.
         region: Lower and upper corner (2, 3) of a box of base positions [m], with any yaw; or a
-            `Free` pose with roll and pitch zero. Components may be fixed.
+            `Free` pose with roll and pitch zero. Components may be fixed. None: at height 0, a box
+            around the palm poses that is wider by the reach of the arm.
         resolution: Size of boxes that are not divided further [m].
-        max_time: Time after which the search ends [s]; the bound holds nevertheless, but the
-            result then depends on the speed of the machine.
+        max_time: Time after which branch and bound ends [s]; the bound holds nevertheless, but the
+            result then depends on the speed of the machine. With a scene, the local search
+            takes at most as long again.
+        prefer: Criterion among bases that reach equally many palm poses: "limits" (arms far from
+            their limits on average) or "center" (near the center of the region). None: none.
+        scene: Obstacles, world frame. Base and arm must then be free of collision, with the hand in
+            its home posture. None: the scene of the solver.
 
     Raises:
-        InputError: An argument has an invalid value.
-        UnsupportedError: The robot does not have one arm with an exact closed form.
+        InputError: An argument has an invalid value, or the scene leaves no room for the base.
+        UnsupportedError: The robot does not have one arm with an exact closed form, or no shapes.
 
     Example:
         >>> palms = robot.palm(robot.random(np.random.default_rng(0), 20))
@@ -148,20 +171,26 @@ def place_base(
             f"place_base: {robot.name} has no exact closed form "
             f"({describe_arm(robot.description)}); expected an arm with one"
         )
-    palms = _palm_poses(grasps)
-    lower, upper = _base_bounds(region)
+    if prefer not in PREFERENCES:
+        names = ", ".join(map(repr, PREFERENCES))
+        raise InputError(f"prefer: found {prefer!r}, expected one of {names}")
+    palms = _palm_poses(solver, grasps)
+    lower, upper = _base_bounds(_box_around(robot, palms) if region is None else region)
     if not isinstance(resolution, int | float) or not 0 < resolution < np.inf:
         raise InputError(f"resolution: found {resolution!r}, expected a length > 0 [m]")
+    world_scene = solver.scene if scene is None else scene
+    if scene is not None:
+        solver = _solver_in_scene(solver, scene, lower, upper)
     reach = PalmReach(robot, family, solver.limits == "enforce", solver._engine.compiled)
-    search = _PlacementSearch(reach, palms, lower, upper, resolution)
+    score = BaseScore(solver, reach, palms, prefer, (lower + upper) / 2, world_scene)
+    search = _PlacementSearch(reach, palms, lower, upper, resolution, score)
     search.run(time.perf_counter() + max_time)  # compiling does not count
-    search.polish()
-    decision = reach.decide(_in_base(palms, search.best))
-    is_reached = decision.code == Reachability.REACHABLE
+    search.polish(np.inf if world_scene is None else time.perf_counter() + max_time)
+    is_reached, q = score.reach(search.best)
     return BasePlacement(
         search.best,
         is_reached,
-        decision.q,
+        q,
         max(search.upper_bound, int(is_reached.sum())),
         np.array(search.bases),
         np.array(search.counts, dtype=np.int64),
@@ -169,17 +198,133 @@ def place_base(
     )
 
 
-def _palm_poses(grasps: ArrayLike | Sequence[Grasp]) -> Array:
+def _solver_in_scene(solver: Any, scene: Scene, lower: Array, upper: Array) -> Any:
+    """Return the solver with a scene as seen from some base that touches no obstacle.
+
+    Raises:
+        InputError: The scene is not a `Scene`, or each base that was tried touches an obstacle.
+        UnsupportedError: The robot has no shapes.
+    """
+    if not isinstance(scene, Scene):
+        raise InputError(f"scene: found {scene!r}, expected a Scene")
+    count = PLACEMENT_PARAMETERS.scene_bases if (lower < upper)[:3].any() else 1
+    problem = ""
+    for fraction in spread_points(count, 4):
+        base = lower + fraction * (upper - lower)
+        seen = scene
+        for name, item in scene.items.items():
+            seen = seen.moved(name, _in_base(item.pose, base))
+        try:
+            return with_scene(solver, seen)
+        except DescriptionError as error:
+            problem = str(error)
+    raise InputError(
+        f"scene: touches the base at all of {count} places of the region; expected room for the "
+        f"base: {problem}"
+    )
+
+
+class BaseScore:
+    """Score of bases: the number of palm poses that are reached free of collision, and more.
+
+    Attributes:
+        has_criteria: True if collisions or a preference count.
+    """
+
+    def __init__(
+        self,
+        solver: Any,
+        reach: PalmReach,
+        palms: Array,
+        prefer: str | None,
+        center: Array,
+        scene: Scene | None,
+    ) -> None:
+        self._solver, self._reach, self._palms = solver, reach, palms
+        items = {} if scene is None else scene.items
+        self._obstacles = {name: item.pose for name, item in items.items()}
+        self._prefer, self._center = prefer, center
+        self._decider = PalmDecider(solver)
+        self.has_criteria = solver.scene is not None or prefer is not None
+
+    def __call__(self, base: Array) -> tuple[int, float]:
+        """Return the number of palm poses that a base (4,) reaches, and the preference."""
+        is_reached, q = self.reach(base)
+        preference = 0.0
+        if self._prefer == "center":
+            preference = -float(np.linalg.norm((base - self._center)[:3]))
+        elif self._prefer == "limits" and is_reached.any():
+            lower, upper = self._reach.lower, self._reach.upper
+            margins = np.minimum(q - lower, upper - q)[is_reached] / (upper - lower)
+            preference = float(margins.min(axis=1).mean())
+        return int(is_reached.sum()), preference
+
+    def reach(self, base: Array) -> tuple[Bools, Array]:
+        """Return (k,) True for the palm poses that a base reaches, and the arms (k, a) [rad]."""
+        solver = self._moved(base)
+        if solver is None:
+            count = len(self._palms), len(self._reach.lower)
+            return np.zeros(count[0], dtype=bool), np.full(count, np.nan)
+        code, q = self._decider.with_solver(solver).decide(_in_base(self._palms, base))
+        return code == Reachability.REACHABLE, q
+
+    def stands_free(self, base: Array) -> bool:
+        """Return True if a base does not touch an obstacle."""
+        return self._moved(base) is not None
+
+    def _moved(self, base: Array) -> Any:
+        """Return the solver with the scene as seen from a base; None if an obstacle touches it."""
+        solver = self._solver
+        try:
+            for name, pose in self._obstacles.items():
+                solver = solver.moved(name, _in_base(pose, base))
+        except DescriptionError:
+            return None
+        return solver
+
+
+def _box_around(robot: ArmHand, palms: Array) -> Array:
+    """Return the corners (2, 3) of the bases at height 0 that may reach one of the palm poses."""
+    corners = reachable_box(robot)
+    reach = float(np.linalg.norm(np.abs(corners).max(axis=0)))
+    origins = palms[:, :3, 3]
+    box = np.array([origins.min(axis=0) - reach, origins.max(axis=0) + reach])
+    box[:, 2] = 0.0
+    return box
+
+
+def _palm_poses(solver: Any, grasps: ArrayLike | Sequence[Grasp]) -> Array:
+    """Return the palm poses (k, 4, 4) of grasps, world frame."""
     if isinstance(grasps, Sequence) and grasps and isinstance(grasps[0], Grasp):
-        palms = [grasp.single_palm if isinstance(grasp, Grasp) else None for grasp in grasps]
-        if any(palm is None for palm in palms):
-            row = next(i for i, palm in enumerate(palms) if palm is None)
-            raise InputError(f"grasps: grasp {row} has no palm pose; expected one in each")
+        palms = [_palm_pose(solver, grasp, row) for row, grasp in enumerate(grasps)]
         return checked_pose(np.array(palms), "grasps")
     poses = checked_pose(grasps, "grasps")  # type: ignore[arg-type]
     if poses.ndim != 3 or not len(poses):
         raise InputError(f"grasps: found shape {poses.shape}, expected (k, 4, 4)")
     return poses
+
+
+def _palm_pose(solver: Any, grasp: Any, row: int) -> Array:
+    """Return the palm pose (4, 4) of a grasp, or one from which the hand meets its contacts."""
+    if not isinstance(grasp, Grasp):
+        raise InputError(f"grasps: row {row} is {grasp!r}; expected a Grasp")
+    if grasp.palm is not None:
+        if grasp.single_palm is None:
+            raise InputError(f"grasps: row {row} has several palm poses; expected one")
+        return grasp.single_palm
+    # The arm's own workspace tells nothing about the hand, so that any reachable pose suffices.
+    world = np.eye(4)
+    world[:3, 3] = np.mean([contact.point for contact in grasp.contacts.values()], axis=0)
+    corners = reachable_box(solver.robot)
+    turns = (np.pi,) * 3
+    free = Free((*corners[0].tolist(), *np.negative(turns)), (*corners[1].tolist(), *turns))
+    contacts = Grasp(grasp.contacts).at(inverse(world)).contacts
+    solution = with_scene(solver, None).solve(Grasp(contacts, object_pose=free))
+    if not solution.success:
+        raise InputError(
+            f"grasps: row {row} has contacts that the hand does not meet; expected a palm pose"
+        )
+    return world @ inverse(solution.object_pose) @ solver.robot.palm(solution.q)
 
 
 def _base_bounds(region: Free | ArrayLike) -> tuple[Array, Array]:
@@ -230,9 +375,16 @@ class _PlacementSearch:
     """
 
     def __init__(
-        self, reach: PalmReach, palms: Array, lower: Array, upper: Array, resolution: float
+        self,
+        reach: PalmReach,
+        palms: Array,
+        lower: Array,
+        upper: Array,
+        resolution: float,
+        score: BaseScore,
     ) -> None:
         self._reach, self._palms, self._resolution = reach, palms, resolution
+        self._score = score
         self._region = lower, upper
         screws = reach.family.screws
         first = screws.joints.index(0)
@@ -275,7 +427,9 @@ class _PlacementSearch:
             for bound, lower, upper, palms in self._bounded(batch):
                 if bound <= self.best_count:
                     continue
-                self.evaluate((lower + upper) / 2, palms)
+                base, count = self.evaluate((lower + upper) / 2, palms)
+                if count > self.best_count and self._score.stands_free(base):
+                    self.best, self.best_count = base, count
                 widths = (upper - lower) * sizes
                 widest = int(np.argmax(widths))
                 if widths[widest] <= self._resolution:
@@ -328,13 +482,16 @@ class _PlacementSearch:
             for mask, box in zip(masks, boxes, strict=True)
         ]
 
-    def evaluate(self, base: Array, rows: Rows, yaws: Array | None = None) -> int:
-        """Count the palm poses that are reached from a base; update the best one.
+    def evaluate(self, base: Array, rows: Rows, yaws: Array | None = None) -> tuple[Array, int]:
+        """Count the palm poses that are reached from a base at samples of the redundancy.
 
         Args:
             base: Base; its yaw is replaced.
             rows: Palm poses that may be reached.
             yaws: Yaw angles to try [rad]; None: spread over the region.
+
+        Returns:
+            The base (4,) with the best yaw, and its number of palm poses.
         """
         angles: Array = self._yaws if yaws is None else yaws
         bases = np.tile(base, (len(angles), 1))
@@ -350,24 +507,47 @@ class _PlacementSearch:
             is_reached[unreached[margin >= 0]] = True
         counts = is_reached.reshape(len(angles), len(rows)).sum(axis=1)
         index = int(np.argmax(counts))
-        count = int(counts[index])
         self.bases.append(bases[index])
-        self.counts.append(count)
-        if count > self.best_count:
-            self.best, self.best_count = bases[index], count
-        return count
+        self.counts.append(int(counts[index]))
+        return bases[index], int(counts[index])
 
-    def polish(self) -> None:
+    def polish(self, deadline: float) -> None:
         """Improve the best base by steps along the coordinates, which shrink."""
+        score = self._choose_finalist(deadline)
         lower, upper = self._region
         length, angle = PLACEMENT_PARAMETERS.polish_steps
         rows = np.arange(len(self._palms))
-        while length >= PLACEMENT_PARAMETERS.polish_end:
-            previous_count = self.best_count
+        _, sampled_count = self.evaluate(self.best, rows, self.best[3:])
+        while length >= PLACEMENT_PARAMETERS.polish_end and time.perf_counter() < deadline:
+            previous_score = score
             for step in np.diag([length, length, length, angle]):
                 for sign in (1.0, -1.0):
                     base = np.clip(self.best + sign * step, lower, upper)
-                    if not np.array_equal(base, self.best):
-                        self.evaluate(base, rows, base[3:])
-            if self.best_count == previous_count:
+                    if np.array_equal(base, self.best):
+                        continue
+                    _, count = self.evaluate(base, rows, base[3:])
+                    is_promising = count >= min(sampled_count, score[0])
+                    if is_promising and (base_score := self._score(base)) > score:
+                        self.best, score, sampled_count = base, base_score, count
+            if score == previous_score:
                 length, angle = length / 2, angle / 2
+        self.bases.append(self.best)
+        self.counts.append(max(score[0], sampled_count))
+
+    def _choose_finalist(self, deadline: float) -> tuple[int, float]:
+        """Store the best of the evaluated bases by their scores; return its score."""
+        score = self._score(self.best)
+        if not self._score.has_criteria:
+            return score
+        candidates = 0
+        for row in np.argsort(-np.array(self.counts), kind="stable").tolist():
+            is_worse = self.counts[row] < score[0]
+            if is_worse or candidates == PLACEMENT_PARAMETERS.finalists:
+                break
+            if time.perf_counter() > deadline or not self._score.stands_free(self.bases[row]):
+                continue
+            candidates += 1
+            base_score = self._score(self.bases[row])
+            if base_score > score:
+                self.best, score = self.bases[row], base_score
+        return score
