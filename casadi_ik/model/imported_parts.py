@@ -134,8 +134,16 @@ def _part(
         shapes = link_shapes(CollisionEntry(links=entries), links, tree.path)
     frame = frame_matrix(end)
     return RobotPart(
-        *(tree.path.stem, f"{location}: ", root, joints, actuators, source, end.link, frame, {}),
-        shapes,
+        name=tree.path.stem,
+        location=f"{location}: ",
+        root=root,
+        joints=joints,
+        actuators=actuators,
+        sources=source,
+        tip_link=end.link,
+        tip=frame,
+        home={},
+        shapes=shapes,
     )
 
 

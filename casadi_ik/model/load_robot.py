@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array, read_only
@@ -60,34 +59,49 @@ def load_description(name_or_path: str | Path) -> RobotDescription:
     """
     files = resolve_robot(name_or_path)
     if not isinstance(files, tuple):
-        return _robot(files)
-    first, hand = files
-    if first is None or first.parent.name != BODIES_FOLDER:
-        return _pair(first, hand)
-    body, units = read(first, BodyFile)
+        return _robot_from_file(files)
+    arm_or_body, hand = files
+    if arm_or_body is None or arm_or_body.parent.name != BODIES_FOLDER:
+        return _shipped_arm_hand(arm_or_body, hand)
+    body, units = read(arm_or_body, BodyFile)
     if hand is None:
-        return body_from_parts(body, first, units)
+        return body_from_parts(body, arm_or_body, units)
     body = msgspec.structs.replace(body, name=f"{body.name}+{hand.stem}")
-    return body_from_parts(body, first, units, hand.stem)
+    return body_from_parts(body, arm_or_body, units, hand.stem)
 
 
-FLANGE = RobotPart(
-    *("flange", "flange: ", "flange"),
-    *([], [], {}, "flange", np.eye(4), {}),
+FLANGE = RobotPart.one_link(
+    "flange",
+    location="flange: ",
     pads={"flange": PadEntry(link="flange", normal=(0.0, 0.0, 1.0))},
 )
 """Hand of an arm alone: its tip, which touches along z."""
 
 
-def _pair(arm_path: Path | None, hand_path: Path | None) -> RobotDescription:
-    """Return a shipped arm with a shipped hand, mounted as the hand's file states."""
+def _shipped_arm_hand(arm_path: Path | None, hand_path: Path | None) -> RobotDescription:
+    """Return a shipped arm with a shipped hand, mounted as the hand's file states.
+
+    An arm without a hand has its flange as the only fingertip; a hand without an arm has a fixed
+    base.
+    """
     arm, hand = None, FLANGE
     if arm_path is not None:
         arm = part_from_file(read(arm_path, ArmFile)[0], arm_path)
     if hand_path is not None:
         hand = part_from_file(read(hand_path, HandFile)[0], hand_path)
     name = "+".join(path.stem for path in (arm_path, hand_path) if path is not None)
-    return _arm_hand(name, arm, hand.mount, hand, list(hand.pads), hand.thumb, {}, {}, {}, name)
+    return _arm_hand(
+        name=name,
+        arm=arm,
+        mount=hand.mount,
+        hand=hand,
+        fingers=list(hand.pads),
+        thumb=hand.thumb,
+        location=name,
+        home={},
+        units={},
+        sources={},
+    )
 
 
 def file_type(raw: Any) -> type[ArmHandFile | ImportedFile | BodyFile | ImportedBody]:
@@ -100,40 +114,52 @@ def file_type(raw: Any) -> type[ArmHandFile | ImportedFile | BodyFile | Imported
     return ImportedFile if is_imported else ArmHandFile
 
 
-def _robot(path: Path) -> RobotDescription:
+def _robot_from_file(path: Path) -> RobotDescription:
+    """Return the robot of a description file."""
     raw = parse_yaml(path)
-    top, units = validated(raw, file_type(raw), path)
-    if isinstance(top, BodyFile):
-        robot = body_from_parts(top, path, units)
-    elif isinstance(top, ImportedBody):
-        robot = body_from_file(top, path, units)
+    robot_file, units = validated(raw, file_type(raw), path)
+    if isinstance(robot_file, BodyFile):
+        robot = body_from_parts(robot_file, path, units)
+    elif isinstance(robot_file, ImportedBody):
+        robot = body_from_file(robot_file, path, units)
     else:
-        robot = _single_hand_robot(top, units, path)
+        robot = _arm_hand_from_file(robot_file, units, path)
     # Shapes of the description override those of imported files.
-    overridden = () if top.collision is None else top.collision.links
-    shapes = robot.shapes.remove_links(overridden) + link_shapes(top.collision, robot.links, path)
+    collision = robot_file.collision
+    overridden = () if collision is None else collision.links
+    shapes = robot.shapes.remove_links(overridden) + link_shapes(collision, robot.links, path)
     return replace(robot, shapes=shapes, path=path)
 
 
-def _single_hand_robot(
-    top: ArmHandFile | ImportedFile, units: dict[str, str], path: Path
+def _arm_hand_from_file(
+    robot_file: ArmHandFile | ImportedFile, units: dict[str, str], path: Path
 ) -> RobotDescription:
-    require_usable_name(top.name, f"{path}: name")
-    arm = None if top.arm is None else load_part(top.arm, "arm", path)
-    if isinstance(top, ArmHandFile):
-        hand = load_part(top.hand, "hand", path)
+    """Return an arm-hand, or a hand on a fixed base, whose parts are in one or two files."""
+    require_usable_name(robot_file.name, f"{path}: name")
+    arm = None if robot_file.arm is None else load_part(robot_file.arm, "arm", path)
+    if isinstance(robot_file, ArmHandFile):
+        hand = load_part(robot_file.hand, "hand", path)
     else:
-        entry, key = top.hand or top.robot, "hand" if top.hand else "robot"
-        if entry is None or (top.hand and top.robot):
+        entry = robot_file.hand or robot_file.robot
+        if entry is None or (robot_file.hand and robot_file.robot):
             raise DescriptionError(f"{path}: expected either 'hand' or 'robot'")
-        if arm is not None and top.robot is not None:
+        if arm is not None and robot_file.robot is not None:
             raise DescriptionError(f"{path}: arm: is given together with 'robot', which has an arm")
-        hand = hand_from_file(entry, top.fingers, key, path)
-    if arm is None and top.mount != Frame():
-        arm = RobotPart("base", f"{path}: ", "base", [], [], {}, "base", np.eye(4), {})
+        key = "hand" if robot_file.hand else "robot"
+        hand = hand_from_file(entry, robot_file.fingers, key, path)
+    if arm is None and robot_file.mount != Frame():
+        arm = RobotPart.one_link("base", location=f"{path}: ")
     return _arm_hand(
-        *(top.name, arm, frame_matrix(top.mount), hand, list(top.fingers), top.thumb),
-        *(top.home, units, top.sources, str(path)),
+        name=robot_file.name,
+        arm=arm,
+        mount=frame_matrix(robot_file.mount),
+        hand=hand,
+        fingers=list(robot_file.fingers),
+        thumb=robot_file.thumb,
+        location=str(path),
+        home=robot_file.home,
+        units=units,
+        sources=robot_file.sources,
     )
 
 
@@ -144,12 +170,25 @@ def _arm_hand(
     hand: RobotPart,
     fingers: list[str],
     thumb: str | None,
+    location: str,
     home: dict[str, float],
     units: dict[str, str],
     sources: dict[str, str],
-    location: str,
 ) -> RobotDescription:
-    """Return the robot of an arm (or None) and a hand on it."""
+    """Return the robot of an arm and a hand.
+
+    Args:
+        name: Name of the robot.
+        arm: The arm; None for a hand on a fixed base.
+        mount: (4, 4) pose of the hand's root on the arm's tip.
+        hand: The hand.
+        fingers: Names of the fingers.
+        thumb: Finger placed first; None for the thumb of the hand's file.
+        location: File or name for error messages.
+        home: Positions by actuator [rad or m]; empty for the positions of the parts.
+        units: Units of numbers that have one, by key.
+        sources: Sources of the robot by tag.
+    """
     if arm is not None:
         hand = prefix_shared_names(hand, arm)
     hand = assign_wrist_to_arm(hand)
@@ -159,8 +198,17 @@ def _arm_hand(
         joints, root = [*arm.joints, mount_joint, *joints], arm.root
         parts.insert(0, (arm.name, arm))
     home = home or {motor: value for _, part in parts for motor, value in part.home.items()}
-    palms = {hand.tip_link}
-    robot, flat = join_parts(name, root, joints, parts, palms, home, units, sources, location)
+    robot, flat = join_parts(
+        name=name,
+        root=root,
+        joints=joints,
+        parts=parts,
+        preserved={hand.tip_link},
+        home=home,
+        units=units,
+        sources=sources,
+        location=location,
+    )
     if thumb is None and hand.thumb in fingers:
         thumb = hand.thumb
     return replace(

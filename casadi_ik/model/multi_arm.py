@@ -6,8 +6,6 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import read_only
 from casadi_ik.files.reading import Frame, frame_matrix
@@ -30,7 +28,7 @@ from casadi_ik.model.parts import (
 )
 from casadi_ik.model.schema import BodyFile, FileSide, ImportedBody, PartSide
 
-FIXED_BASE = RobotPart("base", "", "base", [], [], {}, "base", np.eye(4), {})
+FIXED_BASE = RobotPart.one_link("base")
 """Trunk of a multi-arm robot on a fixed base."""
 
 MAX_SIDES = 4
@@ -125,11 +123,18 @@ def body_from_parts(
         )
         sides.append(_SidePart(name, side_hand, fingers, thumb, tuple(split)))
     palms = {side.hand.tip_link for side in sides}
-    robot_and_joints = join_parts(
-        *(body.name, base.root, joints, parts, palms | {base.tip_link}),
-        *(home | body.home, units, body.sources, str(path)),
+    robot, flat = join_parts(
+        name=body.name,
+        root=base.root,
+        joints=joints,
+        parts=parts,
+        preserved=palms | {base.tip_link},
+        home=home | body.home,
+        units=units,
+        sources=body.sources,
+        location=str(path),
     )
-    return _with_sides(*robot_and_joints, sides, base.tip_link, path)
+    return _with_sides(robot, flat, sides, base.tip_link, path)
 
 
 def body_from_file(body: ImportedBody, path: Path, units: dict[str, str]) -> RobotDescription:
@@ -146,18 +151,24 @@ def body_from_file(body: ImportedBody, path: Path, units: dict[str, str]) -> Rob
     _check_sides(body.name, body.sides, path)
     if body.robot.palm is not None:
         raise DescriptionError(f"{path}: robot.palm: is not allowed; expected palms below 'sides'")
-    robot = hand_from_file(body.robot, {}, "robot", path)
+    part = hand_from_file(body.robot, {}, "robot", path)
     sides, chains = [], {}
     for name, entry in body.sides.items():
-        side, chains[name] = _side_in_file(name, entry, robot, path)
+        side, chains[name] = _side_in_file(name, entry, part, path)
         sides.append(side)
-    end = _trunk_end(body.trunk, sides, chains, robot, path)
-    robot_and_joints = join_parts(
-        *(body.name, robot.root, robot.joints, [("robot", robot)]),
-        {end, *(side.hand.tip_link for side in sides)},
-        *(body.home, units, body.sources, str(path)),
+    trunk_link = _trunk_link(body.trunk, sides, chains, part, path)
+    robot, flat = join_parts(
+        name=body.name,
+        root=part.root,
+        joints=part.joints,
+        parts=[("robot", part)],
+        preserved={trunk_link, *(side.hand.tip_link for side in sides)},
+        home=body.home,
+        units=units,
+        sources=body.sources,
+        location=str(path),
     )
-    return _with_sides(*robot_and_joints, sides, end, path)
+    return _with_sides(robot, flat, sides, trunk_link, path)
 
 
 def _side_in_file(
@@ -186,7 +197,7 @@ def _side_in_file(
     return _SidePart(name, hand, list(pads), thumb), _links_to(palm.link, robot)
 
 
-def _trunk_end(
+def _trunk_link(
     stated: str | None,
     sides: Sequence[_SidePart],
     chains: dict[str, list[str]],
@@ -207,24 +218,24 @@ def _trunk_end(
         )
     first, *remaining = chains.values()
     common = [link for link in first if all(link in chain for chain in remaining)]
-    end = (
+    trunk_link = (
         common[-1]
         if stated is None
         else require_name(stated, robot.links, "link", f"{path}: trunk")
     )
     for name, chain in chains.items():
-        if end not in chain:
+        if trunk_link not in chain:
             raise DescriptionError(
-                f"{path}: trunk: found {end!r}, which does not carry the palm of {name!r}; "
+                f"{path}: trunk: found {trunk_link!r}, which does not carry the palm of {name!r}; "
                 f"expected a link that carries all palms, such as {common[-1]!r}"
             )
-    for joint in chain_to(robot, common[-1], end) if remaining else ():
+    for joint in chain_to(robot, common[-1], trunk_link) if remaining else ():
         if joint.type != "fixed":
             raise DescriptionError(
-                f"{path}: trunk: found {end!r}, but joint {joint.name!r} beyond it moves every "
-                f"palm; expected {common[-1]!r}"
+                f"{path}: trunk: found {trunk_link!r}, but joint {joint.name!r} beyond it moves "
+                f"every palm; expected {common[-1]!r}"
             )
-    return end
+    return trunk_link
 
 
 def _check_sides(name: str, sides: Collection[str], path: Path) -> None:
@@ -253,7 +264,11 @@ def _links_to(link: str, robot: RobotPart) -> list[str]:
 
 
 def _with_sides(
-    robot: RobotDescription, flat: FlatJoints, sides: Sequence[_SidePart], end: str, path: Path
+    robot: RobotDescription,
+    flat: FlatJoints,
+    sides: Sequence[_SidePart],
+    trunk_link: str,
+    path: Path,
 ) -> RobotDescription:
     """Return the robot with the motors and fingers of its sides.
 
@@ -261,16 +276,17 @@ def _with_sides(
         robot: Robot without sides.
         flat: Joints of the robot.
         sides: Sides of the robot.
-        end: Link that carries the sides.
+        trunk_link: Link that carries the sides.
         path: File of the description, for error messages.
 
     Raises:
         DescriptionError: A side is malformed; the message names file, key and expected value.
     """
-    end = flat.anchors[end][0]
-    trunk = _motors(robot, _moving(robot, end))
+    trunk_link = flat.anchors[trunk_link][0]
+    trunk = _driving_motors(robot, _moving_joints(robot, trunk_link))
     # Sides without a moving trunk are solved independently, in the frame of the contacts: the root.
-    end = end if trunk else robot.root
+    if not trunk:
+        trunk_link = robot.root
     fingers: list[Finger] = []
     built_sides: list[Side] = []
     for side in sides:
@@ -279,37 +295,38 @@ def _with_sides(
             side.fingers, side.thumb, side.hand, flat, key, f"{side.name}_"
         )
         side_fingers = [
-            replace(finger, joints=_moving(robot, finger.link)) for finger in side_fingers
+            replace(finger, joints=_moving_joints(robot, finger.link)) for finger in side_fingers
         ]
         palm, pose = flat.anchors[side.hand.tip_link]
         names = tuple(finger.name for finger in side_fingers)
         placement = read_only(pose @ side.hand.tip)
-        arm, hand = side.motors or _motors_of(robot, palm, side_fingers, end)
+        arm, hand = side.motors or _side_motors(robot, palm, side_fingers, trunk_link)
         built_sides.append(Side(side.name, palm, placement, side.thumb, names, arm, hand))
         fingers += side_fingers
     robot = replace(
-        robot, fingers=tuple(fingers), sides=tuple(built_sides), trunk=trunk, trunk_link=end
+        robot, fingers=tuple(fingers), sides=tuple(built_sides), trunk=trunk, trunk_link=trunk_link
     )
     _check_motors(robot, path)
     return robot
 
 
-def _moving(robot: RobotDescription, link: str) -> tuple[str, ...]:
+def _moving_joints(robot: RobotDescription, link: str) -> tuple[str, ...]:
+    """Return the names of the joints that move a link."""
     return tuple(joint.name for joint in robot.chain(link) if joint.type != "fixed")
 
 
-def _motors(robot: RobotDescription, joints: Iterable[str]) -> tuple[str, ...]:
+def _driving_motors(robot: RobotDescription, joints: Iterable[str]) -> tuple[str, ...]:
     """Return the motors that move the joints, in the order of q."""
     return tuple(robot.actuator_names[i] for i in sorted(robot.driving_actuators(joints)))
 
 
-def _motors_of(
-    robot: RobotDescription, palm: str, fingers: Sequence[Finger], end: str
+def _side_motors(
+    robot: RobotDescription, palm: str, fingers: Sequence[Finger], trunk_link: str
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the motors of a side: from the trunk's end to the palm, and below the palm."""
-    to_palm = _moving(robot, palm)
-    arm = _motors(robot, {*to_palm} - {*_moving(robot, end)})
-    below_palm = _motors(robot, _hand_joints(robot, palm, fingers) - {*to_palm})
+    to_palm = _moving_joints(robot, palm)
+    arm = _driving_motors(robot, {*to_palm} - {*_moving_joints(robot, trunk_link)})
+    below_palm = _driving_motors(robot, _hand_joints(robot, palm, fingers) - {*to_palm})
     return arm, tuple(name for name in below_palm if name not in arm)
 
 
@@ -321,11 +338,11 @@ def _hand_joints(robot: RobotDescription, palm: str, fingers: Iterable[Finger]) 
 
 def _check_motors(robot: RobotDescription, path: Path) -> None:
     """Check that every motor belongs to the trunk or to one side."""
-    trunk = {*_moving(robot, robot.trunk_link)}
+    trunk = {*_moving_joints(robot, robot.trunk_link)}
     groups = {"trunk": ("the trunk", robot.trunk, trunk)}
     for side in robot.sides:
         hand_joints = _hand_joints(robot, side.palm_link, map(robot.finger, side.fingers))
-        side_joints = {*_moving(robot, side.palm_link)} | hand_joints
+        side_joints = {*_moving_joints(robot, side.palm_link)} | hand_joints
         groups[f"sides.{side.name}"] = (
             f"side {side.name!r}",
             side.arm + side.hand,

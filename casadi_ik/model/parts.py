@@ -149,6 +149,35 @@ class RobotPart:
     thumb: str | None = None
     mount: Array = field(default_factory=lambda: np.eye(4))
 
+    @classmethod
+    def one_link(
+        cls,
+        link: str,
+        location: str = "",
+        name: str | None = None,
+        pads: Mapping[str, PadEntry] | None = None,
+    ) -> RobotPart:
+        """Return a part that consists of one link without joints.
+
+        Args:
+            link: Name of the link.
+            location: Prefix of its keys in messages.
+            name: Name of the part; None for the name of the link.
+            pads: Contact frames by finger.
+        """
+        return cls(
+            name=link if name is None else name,
+            location=location,
+            root=link,
+            joints=[],
+            actuators=[],
+            sources={},
+            tip_link=link,
+            tip=np.eye(4),
+            home={},
+            pads=pads or {},
+        )
+
     @property
     def links(self) -> tuple[str, ...]:
         """Names of the links; the root is first."""
