@@ -311,7 +311,7 @@ class Follower:
         """
         n, state, goal = self._n, self._inputs.run.state, self._clipped(q)
         state[2 * n : 3 * n], state[3 * n] = goal, 0.0
-        self._recovery.follow()
+        self._recovery.follow_contacts()
         self._is_at_rest, self.posture = False, goal
 
     def _clipped(self, q: ArrayLike) -> Array:
@@ -374,7 +374,7 @@ class Follower:
         n = self._n
         q = state[:n].copy()
         if self._reason:
-            self._recovery.follow()
+            self._recovery.follow_contacts()
         else:
             self._recovery.update(self._inputs, q, state[n : 2 * n], self._is_stopped)
         return q
@@ -420,7 +420,7 @@ class Follower:
 
     def _hold(self) -> Array:
         """Make a step in which the motors decelerate to rest; return the new state."""
-        self._recovery.follow()
+        self._recovery.follow_contacts()
         self._inputs.clear_target()
         if self._is_paused:
             # The motors track the goal, without free motions.
