@@ -40,9 +40,9 @@ from casadi_ik.kinematics.contacts import LENGTH, point_normal_kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
 from casadi_ik.motion import recovery
 from casadi_ik.motion.cycle import CYCLE_TUNING, Cycle
+from casadi_ik.motion.cycle_runner import ERROR_TIME, contact_weights
 from casadi_ik.motion.follower import PALM_WEIGHT, RETURN_SHARE
 from casadi_ik.motion.free_path import motor_units
-from casadi_ik.motion.inputs import ERROR_TIME, contact_weights
 from casadi_ik.motion.motion import RUN_UP, own_velocities
 from casadi_ik.motion.moving import FOLLOWING_PULL, SETTLING
 from casadi_ik.solve.hand_first.method import HandFirstMethod

@@ -19,8 +19,8 @@ from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import point_normal_kinds
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.cycle import side_name
+from casadi_ik.motion.cycle_runner import UNUSED_NORMAL, CycleRunner, FollowerConfig
 from casadi_ik.motion.free_path import minimum_clearance
-from casadi_ik.motion.inputs import UNUSED_NORMAL, FollowerInputs, FollowPlan
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +49,10 @@ class ApproachFinder:
     cycles = 3
     max_deviation = 2e-3
 
-    def __init__(self, plan: FollowPlan) -> None:
-        """Compile the graph unless it is cached; the plan has no velocity limits."""
-        self._robot = plan.robot
-        self._inputs = FollowerInputs(plan, point_normal_kinds(len(plan.robot.fingers)), 0)
+    def __init__(self, config: FollowerConfig) -> None:
+        """Compile the graph unless it is cached; the configuration has no velocity limits."""
+        self._robot = config.robot
+        self._runner = CycleRunner(config, point_normal_kinds(len(config.robot.fingers)), 0)
 
     def find(
         self,
@@ -78,7 +78,7 @@ class ApproachFinder:
         opened_tips = points - opening * share * normals
         opening_path = self._follow(q, opened_tips, {}, has_contact)
         q_open = opening_path[-1]
-        if not self._inputs.cycle.palms:
+        if not self._runner.cycle.palms:
             return ApproachPath(q_open[None], opening_path[::-1])
         coming = self.straight(q_open, -distance * directions * hands_used(robot, problem))
         return None if coming is None else ApproachPath(coming[::-1], opening_path[::-1])
@@ -116,7 +116,7 @@ class ApproachFinder:
             palms: (k, 4, 4) target poses of palms by side; other palms keep their poses.
             has_contact: (f,) True if the target of a fingertip counts.
         """
-        inputs, f = self._inputs, len(has_contact)
+        runner, f = self._runner, len(has_contact)
         values: dict[str, Any] = {
             "points": tips,
             "normals": [UNUSED_NORMAL] * f,
@@ -124,12 +124,12 @@ class ApproachFinder:
             "position_tolerance": np.ones(f),
             "angle_tolerance": np.ones(f),
         }
-        for side in inputs.cycle.palms:
+        for side in runner.cycle.palms:
             poses = palms.get(side, self._robot.palm(q, side))
             fields = {"point": poses[..., :3, 3], "axes": poses[..., :3, :3], "weight": np.ones(2)}
             values |= {side_name(f"palm_{name}", side): array for name, array in fields.items()}
-        rows = np.repeat(inputs.rows(len(tips), values), self.cycles, axis=0)
-        states, _ = inputs.run.run(inputs.state_at(q), rows)
+        rows = np.repeat(runner.rows(len(tips), values), self.cycles, axis=0)
+        states, _ = runner.recurrence.run(runner.state_at(q), rows)
         path = states[self.cycles - 1 :: self.cycles, : len(q)]
         path[0] = q
         return path
@@ -220,11 +220,11 @@ class Approach(RecordReprMixin):
 
 
 @dataclass(frozen=True, eq=False)
-class ApproachPlan:
+class ApproachRequest:
     """Requirements of an approach.
 
     Attributes:
-        plan: Robot and scene.
+        config: Robot and scene.
         problem: Grasp.
         opening: Distance of the fingertips from their contacts before the hand closes [m].
         distance: Length of the straight motion [m].
@@ -233,7 +233,7 @@ class ApproachPlan:
             not specify it.
     """
 
-    plan: FollowPlan
+    config: FollowerConfig
     problem: TargetBatch
     opening: float
     distance: float
@@ -246,7 +246,7 @@ class ApproachPlan:
         The unit vectors are the direction of the plan; or those from the pre-grasp, or else from
         the palm to the contacts, from above, between both, and tilted to each side.
         """
-        robot = self.plan.robot
+        robot = self.config.robot
         if self.direction is not None:
             return [np.tile(_unit(self.direction), (len(robot.fingers), 1))]
         has_contact, tips = ~np.isnan(self.problem.points[0, :, 0]), robot.contacts(q)[0]
@@ -299,18 +299,20 @@ class ApproachAttempt:
     coming_query: CollisionQuery | None
 
 
-def approaches(plan: ApproachPlan, solutions: Sequence[Array]) -> Iterator[ApproachAttempt]:
+def approaches(request: ApproachRequest, solutions: Sequence[Array]) -> Iterator[ApproachAttempt]:
     """Yield the approaches to solutions (n,) of a grasp, in their order."""
-    finder = ApproachFinder(plan.plan)
-    closing_query, open_query = _queries(plan)
+    finder = ApproachFinder(request.config)
+    closing_query, open_query = _queries(request)
     for number, q in enumerate(solutions, start=1):
         blocked_opening = -1.0
         path, reason, coming_query = None, "", open_query
-        for opening, directions in product(plan.opening * OPENING_FRACTIONS, plan.directions(q)):
+        for opening, directions in product(
+            request.opening * OPENING_FRACTIONS, request.directions(q)
+        ):
             if blocked_opening == opening:
                 continue
-            path = finder.find(plan.problem, q, opening, plan.distance, directions)
-            obstruction, coming_query = _obstruction(plan, path, closing_query, open_query)
+            path = finder.find(request.problem, q, opening, request.distance, directions)
+            obstruction, coming_query = _obstruction(request, path, closing_query, open_query)
             reason = reason or obstruction
             if not obstruction:
                 reason = ""
@@ -323,18 +325,18 @@ def approaches(plan: ApproachPlan, solutions: Sequence[Array]) -> Iterator[Appro
         )
 
 
-def approach(plan: ApproachPlan, solutions: Sequence[Array], reason: str) -> Approach:
+def approach(request: ApproachRequest, solutions: Sequence[Array], reason: str) -> Approach:
     """Plan the approach to the first solution of a grasp that has one.
 
     Args:
-        plan: Requirements.
+        request: Requirements.
         solutions: (n,) solutions of the grasp, best first.
         reason: Reason why there are no solutions.
     """
     if not solutions:
         return Approach(ReachStatus.NOT_SOLVED, reason, None, None, None, None, 0)
     reason = ""
-    for attempt in approaches(plan, solutions):
+    for attempt in approaches(request, solutions):
         path = attempt.path
         if path is None:
             reason = reason or attempt.reason
@@ -348,12 +350,12 @@ def approach(plan: ApproachPlan, solutions: Sequence[Array], reason: str) -> App
     return Approach(ReachStatus.NO_APPROACH, reason, None, None, None, None, count)
 
 
-def _queries(plan: ApproachPlan) -> tuple[CollisionQuery | None, CollisionQuery | None]:
+def _queries(request: ApproachRequest) -> tuple[CollisionQuery | None, CollisionQuery | None]:
     """Return the collision checks while the hand closes, and before it closes.
 
     Before the hand closes, the fingers must not touch the object either.
     """
-    check, problem = plan.plan.check, plan.problem
+    check, problem = request.config.check, request.problem
     if check is None:
         return None, None
     row = np.zeros(1, dtype=np.intp)
@@ -367,7 +369,7 @@ CLOSING_PREFIX = "the closing"
 
 
 def _obstruction(
-    plan: ApproachPlan,
+    request: ApproachRequest,
     path: ApproachPath | None,
     closing_query: CollisionQuery | None,
     open_query: CollisionQuery | None,
@@ -392,15 +394,15 @@ def _obstruction(
     if (
         pregrasp_is_free
         and not minimum_clearance(closing_query, path.coming)[1]
-        and _pads_are_free(plan, path.coming)
+        and _pads_are_free(request, path.coming)
     ):
         return "", closing_query
     return f"the approach is not free: {contact}", open_query
 
 
-def _pads_are_free(plan: ApproachPlan, q: Array) -> bool:
+def _pads_are_free(request: ApproachRequest, q: Array) -> bool:
     """Return True if the pads do not penetrate the object in postures (k, n)."""
-    check, problem = plan.plan.check, plan.problem
+    check, problem = request.config.check, request.problem
     assert check is not None
     name = problem.object or check.scene.grasped or ""
     pose = None if problem.object_pose is None else problem.object_pose[0]
@@ -412,7 +414,7 @@ def _pads_are_free(plan: ApproachPlan, q: Array) -> bool:
     has_contact = ~np.isnan(problem.points[0, :, 0])
     poses = np.tile(np.eye(4), (len(q), 1, 1))
     for i in np.flatnonzero(has_contact):
-        poses[:, :3, 3] = plan.plan.robot.contacts(q)[0][:, i]
+        poses[:, :3, 3] = request.config.robot.contacts(q)[0][:, i]
         if gaps(pad, [solid], poses).min() < -MAX_PAD_PENETRATION:
             return False
     return True

@@ -160,6 +160,28 @@ def track_goal(s: dict[str, Expr], goal: Expr, goal_step: Expr, p: dict[str, Exp
     return ca.fmin(ca.fmax(q, p["lower"]), p["upper"])
 
 
+@dataclass(frozen=True)
+class StateFields:
+    """Positions of the fields of `Cycle.state` in its vector.
+
+    Attributes:
+        q: Commanded positions.
+        last_step: Last step of the motors.
+        goal: Goal of the motors.
+        locked_on: 1 if the motors are at the goal, 0 if they track it.
+    """
+
+    q: slice
+    last_step: slice
+    goal: slice
+    locked_on: int
+
+    @classmethod
+    def of(cls, n: int) -> StateFields:
+        """Return the positions for n motors."""
+        return cls(slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n), 3 * n)
+
+
 PALM_ROWS = 12
 """Number of rows of a palm's residual: position and three axes."""
 

@@ -17,10 +17,10 @@ from casadi_ik.files.keypoints import lost_contacts_reason
 from casadi_ik.kinematics.contacts import Kinds, group_by_kinds, point_normal_kinds
 from casadi_ik.model.grasp import Grasp, real_array
 from casadi_ik.motion.clutch import Clutch, Poses
-from casadi_ik.motion.cycle import CYCLE_TUNING
+from casadi_ik.motion.cycle import CYCLE_TUNING, StateFields
+from casadi_ik.motion.cycle_runner import CycleRunner, FollowerConfig
 from casadi_ik.motion.free_path import motor_units
 from casadi_ik.motion.guard import Guard, braked, stopping_distance
-from casadi_ik.motion.inputs import FollowerInputs, FollowPlan
 from casadi_ik.motion.recovery import Recovery, brake
 from casadi_ik.solve.solution import Pair
 from casadi_ik.solve.verdict import TOLERANCE_SLACK
@@ -37,7 +37,7 @@ class FollowStatus(Enum):
     FOLLOWING = "following"
     """The contacts are within tolerance."""
     LATE = "late"
-    """The motors approach the goal; velocity and acceleration limits delay them."""
+    """The goal meets the contacts; velocity and acceleration limits delay the motors."""
     MISSED = "missed"
     """Configurations on this branch do not meet the contacts: these are out of reach, or beyond a
     limit."""
@@ -49,11 +49,11 @@ class FollowStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """Configuration that is nearer to the target of a follower than its goal.
+    """Configuration whose contact errors are smaller than those of a follower's goal.
 
     Attributes:
         q: (n,) configuration [rad or m].
-        gain: Decrease of the largest error over its tolerance.
+        gain: Decrease of the error ratio, the largest error of a contact over its tolerance.
         travel: Largest distance of a motor from its present position [rad or m].
 
     Example:
@@ -109,9 +109,8 @@ class FollowState:
     cycles: int
 
 
-NO_FRAME = "no frame yet"
-
-PAUSED = "paused"
+NO_FRAME_REASON, PAUSED_REASON = "no frame yet", "paused"
+"""Values of `FollowState.reason` before the first frame, and during a pause."""
 
 RETURN_SHARE = 0.2
 """Share of the velocity limits at which motors return from beyond their limits."""
@@ -119,7 +118,7 @@ RETURN_SHARE = 0.2
 MIN_GAIN = 0.1
 """Minimum decrease of the error ratio on a better branch, relative to the present one."""
 
-IDENTITY = np.eye(4)
+LOST_HAND_POSE = np.eye(4)
 """Pose that trackers send for a lost hand; a real palm does not coincide with the base frame."""
 
 PALM_WEIGHT = 0.1
@@ -149,41 +148,44 @@ class Follower:
         'FOLLOWING'
     """
 
-    def __init__(self, plan: FollowPlan) -> None:
+    def __init__(self, config: FollowerConfig) -> None:
         """Compile the graphs and allocate the memory; `Solver.follow` calls this."""
-        self._plan = plan
-        self.period = plan.period
-        self.velocity, self.acceleration = plan.rates.velocity, plan.rates.acceleration
-        self._change = plan.rates.steps(plan.period)[1]
-        robot = plan.robot
-        self._n, self._shape = len(robot.actuators), (len(robot.fingers), 3)
-        self._point_kinds = point_normal_kinds(self._shape[0])
-        self._tolerances = self._plan_tolerances = tuple(plan.target_builder.tolerances.values())
-        self._inputs_by_kinds: dict[Kinds, FollowerInputs] = {}
-        self._posture = plan.posture
-        self._guard = None if plan.check is None else Guard(plan)
-        self._inputs = self._inputs_of(self._point_kinds)
-        max_step, max_change = plan.rates.steps(plan.period)
-        units = motor_units(robot)
-        self._recovery = Recovery(units, max_step, max_change, plan.period, self._guard)
-        self.reset(plan.q0)
+        self._config = config
+        self.period = config.period
+        self.velocity, self.acceleration = config.rates.velocity, config.rates.acceleration
+        robot = config.robot
+        self._fields = StateFields.of(len(robot.actuators))
+        self._contacts_shape = (len(robot.fingers), 3)
+        self._point_normal_kinds = point_normal_kinds(len(robot.fingers))
+        self._default_tolerances = tuple(config.target_builder.tolerances.values())
+        self._tolerances = self._default_tolerances
+        self._runner_by_kinds: dict[Kinds, CycleRunner] = {}
+        self._posture = config.posture
+        self._guard = None if config.check is None else Guard(config)
+        self._runner = self._runner_for(self._point_normal_kinds)
+        max_step, self._max_change = config.rates.steps(config.period)
+        self._recovery = Recovery(
+            motor_units(robot), max_step, self._max_change, config.period, self._guard
+        )
+        self.reset(config.q0)
 
-    def _inputs_of(self, kinds: Kinds) -> FollowerInputs:
-        """Return the graph and memory for given kinds of contacts."""
-        inputs = self._inputs_by_kinds.get(kinds)
-        if inputs is None:
+    def _runner_for(self, kinds: Kinds) -> CycleRunner:
+        """Return the evaluator of cycles for given kinds of contacts."""
+        runner = self._runner_by_kinds.get(kinds)
+        if runner is None:
             obstacles = 0 if self._guard is None else OBSTACLES
-            inputs = self._inputs_by_kinds[kinds] = FollowerInputs(self._plan, kinds, obstacles)
-            inputs.set_posture(self._posture)
-        return inputs
+            runner = self._runner_by_kinds[kinds] = CycleRunner(self._config, kinds, obstacles)
+            runner.set_posture(self._posture)
+        return runner
 
     def _switch_kinds(self, kinds: Kinds) -> None:
         """Continue with contacts of other kinds."""
-        n, previous = 3 * self._n + 1, self._inputs.run.state
-        self._inputs = self._inputs_of(kinds)
-        state = self._inputs.run.state
-        # The previous residual belongs to other rows.
-        state[:n], state[n:] = previous[:n], 0.0
+        previous = self._runner.recurrence.state
+        self._runner = self._runner_for(kinds)
+        state = self._runner.recurrence.state
+        # The residual behind `locked_on` is reset, because its rows depend on the kinds.
+        residual_start = self._fields.locked_on + 1
+        state[:residual_start], state[residual_start:] = previous[:residual_start], 0.0
 
     def reset(self, q: ArrayLike) -> None:
         """Restart at rest at a configuration, for a robot that something else has moved.
@@ -201,10 +203,10 @@ class Follower:
             >>> bool(np.allclose(follower.state.q, solution.q))
             True
         """
-        start = self._plan.target_builder.start(q)
-        self._inputs.run.state[:] = self._inputs.state_at(start)
-        self._reason, self._cycles, self._is_stopped = NO_FRAME, 0, False
-        self._is_paused, self._is_at_rest, self._clutch = False, False, None
+        start = self._config.target_builder.start(q)
+        self._runner.recurrence.state[:] = self._runner.state_at(start)
+        self._reason, self._cycles, self._is_stopped = NO_FRAME_REASON, 0, False
+        self._is_paused, self._brakes_in_pause, self._clutch = False, False, None
         self._is_beyond_limits = True
         self._recovery.reset(self._clipped(start))
 
@@ -219,7 +221,7 @@ class Follower:
             >>> bool((follower(grasp) == solution.q).all()), follower.state.reason
             (True, 'paused')
         """
-        self._is_paused, self._is_at_rest, self._reason = True, True, PAUSED
+        self._is_paused, self._brakes_in_pause, self._reason = True, True, PAUSED_REASON
 
     def resume(self, q: ArrayLike | None = None) -> None:
         """Close the clutch: the robot moves as the targets move from now on.
@@ -245,7 +247,7 @@ class Follower:
         """
         if q is not None:
             self.reset(q)
-        self._is_paused, self._clutch = False, Clutch(self._plan.robot)
+        self._is_paused, self._clutch = False, Clutch(self._config.robot)
         self.posture = self._posture_at_rest()
 
     @property
@@ -264,17 +266,18 @@ class Follower:
     @posture.setter
     def posture(self, q: ArrayLike) -> None:
         self._posture = self._clipped(q)
-        for inputs in self._inputs_by_kinds.values():
-            inputs.set_posture(self._posture)
+        for runner in self._runner_by_kinds.values():
+            runner.set_posture(self._posture)
 
     def better_branch(self) -> Branch | None:
-        """Search for a configuration that is nearer to the present target than the goal is.
+        """Search for a configuration with a smaller error than the goal for the present target.
 
         The search takes milliseconds, so it is not part of a cycle, and the follower never changes
         its branch by itself: `branch` moves to the result.
 
         Returns:
-            The branch, or None if the target is met or no nearer configuration was found.
+            The branch; None if the goal meets the target, or if no configuration was found whose
+            error ratio is smaller by at least a tenth.
 
         Example:
             >>> follower = solver.follow(q0=solution.q)
@@ -282,12 +285,12 @@ class Follower:
             >>> follower.better_branch() is None
             True
         """
-        ratio, q = self._inputs.goal_error_ratio, self._posture_at_rest()
-        if self._reason or ratio <= 1.0:
+        error_ratio, q = self._runner.goal_error_ratio, self._posture_at_rest()
+        if self._reason or error_ratio <= 1.0:
             return None
-        nearest = self._plan.nearest(self._inputs.target(), q)
-        gain = ratio - self._inputs.exact_error_ratio(nearest)
-        if not gain > MIN_GAIN * ratio:
+        nearest = self._config.nearest(self._runner.target(), q)
+        gain = error_ratio - self._runner.exact_error_ratio(nearest)
+        if not gain > MIN_GAIN * error_ratio:
             return None
         return Branch(q=nearest, gain=gain, travel=float(np.abs(nearest - q).max()))
 
@@ -309,13 +312,14 @@ class Follower:
             >>> follower(grasp).shape
             (14,)
         """
-        n, state, goal = self._n, self._inputs.run.state, self._clipped(q)
-        state[2 * n : 3 * n], state[3 * n] = goal, 0.0
+        fields, state, goal = self._fields, self._runner.recurrence.state, self._clipped(q)
+        state[fields.goal], state[fields.locked_on] = goal, 0.0
         self._recovery.follow_contacts()
-        self._is_at_rest, self.posture = False, goal
+        self._brakes_in_pause, self.posture = False, goal
 
     def _clipped(self, q: ArrayLike) -> Array:
-        return np.clip(self._plan.target_builder.start(q), *self._plan.bounds)
+        """Return checked positions (n,), clipped to the limits."""
+        return np.clip(self._config.target_builder.start(q), *self._config.bounds)
 
     def __call__(
         self,
@@ -346,56 +350,57 @@ class Follower:
         self._cycles += 1
         if self._is_paused:
             return self._finish(self._hold())
-        poses, self._reason = self._poses(palm)
+        poses, self._reason = self._checked_poses(palm)
         if isinstance(target, Grasp):
             self._set_grasp(target, normals)
             return self._finish(self._hold() if self._reason else self._step(poses, palm_weight))
         points = self._vectors("points", target)
         directions = None if normals is None else self._vectors("normals", normals)
-        # All points of a lost hand coincide; this cheap test is rarely true.
+        # All points of a lost hand coincide; comparing two numbers first is cheap.
         if points[0, 0] == points[-1, 0]:
             self._reason = self._reason or lost_contacts_reason(points)
         if self._reason:
             return self._finish(self._hold())
-        if self._inputs.cycle.kinds != self._point_kinds:
-            self._switch_kinds(self._point_kinds)
-        self._tolerances = self._plan_tolerances
+        if self._runner.cycle.kinds != self._point_normal_kinds:
+            self._switch_kinds(self._point_normal_kinds)
+        self._tolerances = self._default_tolerances
         if self._clutch is not None:
             q = self._posture_at_rest()
             points, directions, poses = self._clutch.displaced(q, points, directions, poses)
-        self._inputs.set_contacts(points, directions)
+        self._runner.set_contacts(points, directions)
         state = self._step(poses, palm_weight)
-        if not self._inputs.is_finite:
+        # Contacts that are not finite are rare, so they are checked only after the step.
+        if not self._runner.is_finite:
             state = self._repeat_with_free_contacts(points, directions, poses, palm_weight)
         return self._finish(state)
 
     def _finish(self, state: Array) -> Array:
         """Update the recovery after a cycle; return the positions (n,) of the motors."""
-        n = self._n
-        q = state[:n].copy()
+        q = state[self._fields.q].copy()
         if self._reason:
             self._recovery.follow_contacts()
         else:
-            self._recovery.update(self._inputs, q, state[n : 2 * n], self._is_stopped)
+            last_step = state[self._fields.last_step]
+            self._recovery.update(self._runner, q, last_step, self._is_stopped)
         return q
 
     def _step(self, palms: Poses, palm_weight: tuple[float, float]) -> Array:
         """Make a step towards the target; return the new state."""
-        inputs = self._inputs
+        runner = self._runner
         if self._is_beyond_limits:
             self._return_to_limits()
         if palms:
-            inputs.set_palms(palms, palm_weight)
-        state = inputs.run.state
+            runner.set_palms(palms, palm_weight)
+        state = runner.recurrence.state
         step = self._recovery.step(state)
-        if self._is_paused and self._is_at_rest:
-            step = braked(state[self._n : 2 * self._n], self._change)
+        if self._is_paused and self._brakes_in_pause:
+            step = braked(state[self._fields.last_step], self._max_change)
         if self._guard is not None:
-            state, self._is_stopped = self._guard.step(inputs, step)
+            state, self._is_stopped = self._guard.step(runner, step)
         else:
-            state = inputs.run.step() if step is None else inputs.step_by(step)
+            state = runner.recurrence.step() if step is None else runner.step_by(step)
         if palms:
-            inputs.clear_palms()
+            runner.clear_palms()
         return state
 
     def _repeat_with_free_contacts(
@@ -406,88 +411,95 @@ class Follower:
         palm_weight: tuple[float, float],
     ) -> Array:
         """Repeat the last step with contacts that are partly free or invalid."""
-        inputs = self._inputs
-        inputs.run.back()
-        free = np.full(self._shape, np.nan)
-        self._reason = inputs.set_partial_contacts(points, free if normals is None else normals)
+        runner = self._runner
+        runner.recurrence.back()
+        free = np.full(self._contacts_shape, np.nan)
+        self._reason = runner.set_partial_contacts(points, free if normals is None else normals)
         if not self._reason:
             state = self._step(palms, palm_weight)
-            if inputs.is_finite:
+            if runner.is_finite:
                 return state
-            inputs.run.back()
+            runner.recurrence.back()
             self._reason = "a number is out of range"
         return self._hold()
 
     def _hold(self) -> Array:
         """Make a step in which the motors decelerate to rest; return the new state."""
         self._recovery.follow_contacts()
-        self._inputs.clear_target()
+        self._runner.clear_target()
         if self._is_paused:
-            # The motors track the goal, without free motions.
-            self._inputs.run.state[3 * self._n] = 0.0
+            # The motors brake, or track the goal that `branch` has set, without free motions.
+            self._runner.recurrence.state[self._fields.locked_on] = 0.0
         else:
-            self._set_goal_at_rest(self._inputs)
+            self._set_goal_at_rest()
         return self._step({}, (PALM_WEIGHT, PALM_WEIGHT))
 
     def _set_grasp(self, grasp: Grasp, normals: ArrayLike | None) -> None:
+        """Set the contacts of a grasp as the target of the cycle."""
         if normals is not None:
             raise InputError("normals: found in addition to a grasp, expected None")
-        problem = self._plan.target_builder.from_grasps([grasp])
+        problem = self._config.target_builder.from_grasps([grasp])
         ((kinds, _, _),) = group_by_kinds(problem)
-        if kinds != self._inputs.cycle.kinds:
+        if kinds != self._runner.cycle.kinds:
             self._switch_kinds(kinds)
         self._tolerances = problem.tolerances
-        self._inputs.set_target(problem)
+        self._runner.set_target(problem)
         if self._guard is not None:
             self._guard.set_target(problem)
 
     def _return_to_limits(self) -> None:
         """Set bounds that lead motors beyond their limits back to them."""
-        n, state = self._n, self._inputs.run.state
-        q, (lower, upper) = state[:n], self._plan.bounds
-        way = np.clip(q, lower, upper) - q
-        direction, distance = np.sign(way), np.abs(way)
-        change = CYCLE_TUNING.braking_share * self._change
-        step = np.maximum(direction * state[n : 2 * n], 0.0) + change
+        fields, state = self._fields, self._runner.recurrence.state
+        q, (lower, upper) = state[fields.q], self._config.bounds
+        excess = np.clip(q, lower, upper) - q
+        direction, distance = np.sign(excess), np.abs(excess)
+        change = CYCLE_TUNING.braking_share * self._max_change
+        step = np.maximum(direction * state[fields.last_step], 0.0) + change
         step = np.minimum(step, RETURN_SHARE * self.velocity * self.period)
         q_next = q + direction * np.minimum(step, brake(distance, change))
-        for inputs in self._inputs_by_kinds.values():
-            inputs.set_bounds(np.minimum(lower, q_next), np.maximum(upper, q_next))
+        for runner in self._runner_by_kinds.values():
+            runner.set_bounds(np.minimum(lower, q_next), np.maximum(upper, q_next))
         self._is_beyond_limits = bool(distance.any())
 
     def _posture_at_rest(self) -> Array:
         """Return the positions (n,) at which the motors can stop."""
-        n, state = self._n, self._inputs.run.state
-        return state[:n] + stopping_distance(state[n : 2 * n], self._change)
+        fields, state = self._fields, self._runner.recurrence.state
+        return state[fields.q] + stopping_distance(state[fields.last_step], self._max_change)
 
-    def _set_goal_at_rest(self, inputs: FollowerInputs) -> None:
+    def _set_goal_at_rest(self) -> None:
         """Set the goal to the positions at which the motors can stop."""
-        n, state = self._n, inputs.run.state
-        state[2 * n : 3 * n] = self._posture_at_rest()
-        state[3 * n] = 0.0
+        fields, state = self._fields, self._runner.recurrence.state
+        state[fields.goal], state[fields.locked_on] = self._posture_at_rest(), 0.0
 
     def _vectors(self, name: str, value: ArrayLike) -> Array:
         """Return vectors (f, 3); their numbers may be NaN or infinite."""
-        if type(value) is np.ndarray and value.dtype == np.float64 and value.shape == self._shape:
+        if (
+            type(value) is np.ndarray
+            and value.dtype == np.float64
+            and value.shape == self._contacts_shape
+        ):
             return value
         try:
             array = real_array(value)
         except (TypeError, ValueError) as error:
             raise InputError(f"{name}: array is not numeric: {error}") from error
-        if array.shape != self._shape:
-            raise InputError(f"{name}: found shape {array.shape}, expected {self._shape}")
+        if array.shape != self._contacts_shape:
+            raise InputError(f"{name}: found shape {array.shape}, expected {self._contacts_shape}")
         return array
 
     @property
     def moves_palm(self) -> bool:
         """True if an arm moves the palm, so that it may have a target pose."""
-        return bool(self._inputs.cycle.palms)
+        return bool(self._runner.cycle.palms)
 
-    def _poses(self, palm: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Poses, str]:
-        """Return the poses of palms by side, and the reason why they are invalid, or ""."""
+    def _checked_poses(self, palm: ArrayLike | Mapping[str, ArrayLike] | None) -> tuple[Poses, str]:
+        """Return the poses (4, 4) of palms by side, and the reason why they are invalid, or "".
+
+        The side is None for a single arm-hand.
+        """
         if palm is None:
             return {}, ""
-        palms = self._inputs.cycle.palms
+        palms = self._runner.cycle.palms
         if not palms:
             raise InputError("palm: found a pose for a palm that does not move, expected None")
         poses = palm if isinstance(palm, Mapping) else {None: palm}
@@ -504,31 +516,36 @@ class Follower:
                 checked[side] = single_pose(pose, name)
             except InvalidPoseError as error:
                 return {}, str(error)
-            if (checked[side] == IDENTITY).all():
+            if (checked[side] == LOST_HAND_POSE).all():
                 return {}, f"{name}: the identity, which trackers send for a lost hand"
         return checked, ""
 
     @property
     def state(self) -> FollowState:
         """State after the last cycle."""
-        n, inputs = self._n, self._inputs
-        q, last_step, goal = (row.copy() for row in inputs.run.state[: 3 * n].reshape(3, n))
-        is_free = inputs.views["weights"].T == 0
-        names = "position_error", "angle_error", "goal_position_error", "goal_angle_error"
+        runner, fields = self._runner, self._fields
+        state = runner.recurrence.state
+        q, last_step = state[fields.q].copy(), state[fields.last_step].copy()
+        is_point_free, is_normal_free = runner.parameters["weights"].T == 0
+        is_free = {
+            "position_error": is_point_free,
+            "angle_error": is_normal_free,
+            "goal_position_error": is_point_free,
+            "goal_angle_error": is_normal_free,
+        }
         errors = {
-            name: np.where(is_free[i % 2], np.nan, inputs.record[name])
-            for i, name in enumerate(names)
+            name: np.where(free, np.nan, runner.record[name]) for name, free in is_free.items()
         }
         if self._is_stopped:
             # The record describes the step of the graph, which the guard has replaced.
-            errors["position_error"], errors["angle_error"] = inputs.errors(q)
+            errors["position_error"], errors["angle_error"] = runner.errors(q)
         clearances = None if self._guard is None else self._guard.clearance(q)
         return FollowState(
             status=self._status(errors),
             reason=self._reason,
             q=q,
             velocity=last_step / self.period,
-            goal=goal,
+            goal=state[fields.goal].copy(),
             **errors,
             clearance=None if clearances is None else float(clearances.distance[0]),
             closest=None if clearances is None else clearances.pair(0),

@@ -21,7 +21,8 @@ from casadi_ik.collision.clearance_kernel import OBSTACLES, Guarding
 from casadi_ik.collision.distances import levers
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.motion.inputs import FollowerInputs, FollowPlan, clip_step
+from casadi_ik.motion.cycle import StateFields
+from casadi_ik.motion.cycle_runner import CycleRunner, FollowerConfig, clip_step
 
 
 def stopping_distance(step: Array, change: Array) -> Array:
@@ -52,9 +53,9 @@ def stopping_path(q: Array, step: Array, change: Array) -> Array:
         (k, n) positions at the end of each cycle; the first is after the step, the last at rest.
     """
     speed = np.abs(step)
-    cycles = np.floor(speed / change)
-    braked = np.minimum(np.arange(cycles.max() + 1)[:, None], cycles)
-    return q + step + np.sign(step) * (speed * braked - change * braked * (braked + 1) / 2)
+    cycles_to_rest = np.floor(speed / change)
+    cycles = np.minimum(np.arange(cycles_to_rest.max() + 1)[:, None], cycles_to_rest)
+    return q + step + np.sign(step) * (speed * cycles - change * cycles * (cycles + 1) / 2)
 
 
 class Guard:
@@ -63,33 +64,36 @@ class Guard:
     Attributes:
         avoidance_distance: Clearance beyond the margin below which the goal avoids a pair [m].
         nudge: Step of the finite differences of clearances [rad or m].
-        exact: Accuracy of distances of solids, with a reserve [m].
+        distance_accuracy: Accuracy of distances of solids, with a reserve [m].
         fractions: Fractions of the requested step that are attempted before a motor brakes.
     """
 
     avoidance_distance = 0.01
     nudge = 1e-4
-    exact = 1e-6
+    distance_accuracy = 1e-6
     fractions = (1.0,)
 
-    def __init__(self, plan: FollowPlan) -> None:
-        """Prepare the scene for targets that all fingers touch."""
-        assert plan.check is not None
-        self._check, self._robot = plan.check, plan.robot.description
-        fingers, n = len(plan.robot.fingers), len(plan.robot.actuators)
-        self._n, self._change = n, plan.rates.steps(plan.period)[1]
-        self._bounds = plan.bounds
-        self._hand = np.isin(np.arange(n), self._robot.hand_actuators).astype(float)
-        self._side = np.zeros(n)
-        self._side[list(self._robot.trunk_actuators)] = -1
-        for number, motors in enumerate(self._robot.side_actuators):
-            self._side[list(sum(motors, ()))] = number
-        anywhere = np.zeros((1, fingers, 3))
-        self._query = self._query_of(plan.target_builder.from_arrays(anywhere, anywhere + 1.0))
+    def __init__(self, config: FollowerConfig) -> None:
+        """Prepare the scene for targets with contacts of all fingers."""
+        assert config.check is not None
+        self._check, self._robot = config.check, config.robot.description
+        fingers, n = len(config.robot.fingers), len(config.robot.actuators)
+        self._n, self._change = n, config.rates.steps(config.period)[1]
+        self._bounds = config.bounds
+        self._fields = StateFields.of(n)
+        self._is_hand_motor = np.isin(np.arange(n), self._robot.hand_actuators).astype(float)
+        # Index of the side that a motor belongs to; -1 for motors of the trunk.
+        self._side_index = np.zeros(n)
+        self._side_index[list(self._robot.trunk_actuators)] = -1
+        for index, (arm_motors, hand_motors) in enumerate(self._robot.side_actuators):
+            self._side_index[[*arm_motors, *hand_motors]] = index
+        # Which fingers have contacts matters, but not where.
+        zeros = np.zeros((1, fingers, 3))
+        self._query = self._query_of(config.target_builder.from_arrays(zeros, zeros + 1.0))
         self._allocate()
 
     def set_target(self, problem: TargetBatch) -> None:
-        """Adapt the scene to one target: which fingers touch, and the pose of the object."""
+        """Adapt the scene to a batch of one target: its touching fingers and its object pose."""
         query, previous = self._query_of(problem), self._query
         self._query = query
         if query.table is not previous.table:
@@ -98,12 +102,13 @@ class Guard:
             self._compiled.surround(query.poses)
 
     def _query_of(self, problem: TargetBatch) -> CollisionQuery:
+        """Return the collision checks for a batch of one target, at any number of postures."""
         return self._check.collision_query(problem).rows(np.zeros(1, dtype=np.intp))
 
     def _allocate(self) -> None:
-        """Allocate the memory of the compiled checks."""
+        """Allocate the memory of the compiled checks, after a change of the pairs of shapes."""
         query = self._query
-        self._required = query.margin + self.exact
+        self._required = query.margin + self.distance_accuracy
         self._avoided = query.margin + self.avoidance_distance
         self._levers = levers(self._robot, query.table)
         self._compiled = None
@@ -113,8 +118,8 @@ class Guard:
                 query.poses,
                 query.table,
                 self._levers,
-                self._hand,
-                self._side,
+                self._is_hand_motor,
+                self._side_index,
                 self._change,
                 self.fractions,
                 required_distance=self._required,
@@ -134,7 +139,7 @@ class Guard:
         return bool((distances >= required).all())
 
     def posture_with_clearance(self, q: Array, units: Array) -> Array:
-        """Return the nearest configuration (n,) with the lacking clearances of one, to first order.
+        """Return the nearest configuration (n,) without lacking clearances, to first order.
 
         Args:
             q: (n,) configuration.
@@ -142,37 +147,39 @@ class Guard:
         """
         lacking, slopes = self._lacking_clearances(q)
         rows = slopes[lacking > 0] * units
+        # Singular directions below a tenth of the largest would require long motions.
         motion = units * (np.linalg.pinv(rows, rcond=0.1) @ lacking[lacking > 0])
         return np.clip(q + motion, *self._bounds)
 
-    def step(self, inputs: FollowerInputs, step: Array | None = None) -> tuple[Array, bool]:
+    def step(self, runner: CycleRunner, step: Array | None = None) -> tuple[Array, bool]:
         """Make a step, or the fraction of it after which the motors can still stop in time.
 
         Args:
-            inputs: Graph of the cycle and its memory.
+            runner: Graph of the cycle and its memory.
             step: (n,) step of the motors; None: the step of the graph.
 
         Returns:
             The new state, and True if motors had to brake.
         """
-        n, run = self._n, inputs.run
-        state = run.state
+        recurrence, fields = runner.recurrence, self._fields
+        state = recurrence.state
         if step is None:
-            lacking, slopes = inputs.views["lacking"], inputs.views["slopes"]
-            lacking[...], slopes[...] = self._lacking_clearances(state[2 * n : 3 * n])
-            new_state = run.step()
+            lacking, slopes = runner.parameters["lacking"], runner.parameters["slopes"]
+            lacking[...], slopes[...] = self._lacking_clearances(state[fields.goal])
+            new_state = recurrence.step()
         else:
-            new_state = inputs.step_by(step)
-        q, requested_step = state[:n], new_state[n : 2 * n]
-        fraction, step, q_rest = self._free_step(q, state[n : 2 * n], requested_step)
+            new_state = runner.step_by(step)
+        q, requested_step = state[fields.q], new_state[fields.last_step]
+        fraction, step, q_rest = self._free_step(q, state[fields.last_step], requested_step)
         is_stopped = fraction < 1.0
         if not is_stopped.any():
             return new_state, False
         # Rounding errors of a motor that stops at a limit must not exceed it.
-        new_state[:n], new_state[n : 2 * n] = clip_step(q, step, self._bounds), step
+        new_state[fields.q] = clip_step(q, step, self._bounds)
+        new_state[fields.last_step] = step
         # Without this reset, the goal of a stopped motor could lie behind an obstacle.
-        np.copyto(new_state[2 * n : 3 * n], q_rest, where=is_stopped)
-        new_state[3 * n] = 0.0
+        np.copyto(new_state[fields.goal], q_rest, where=is_stopped)
+        new_state[fields.locked_on] = 0.0
         return new_state, True
 
     def _free_step(
@@ -209,18 +216,29 @@ class Guard:
             attempts += is_reduced
 
     def _blocking_motors(self, moves_pair: Bools) -> Bools:
-        """Return (n,) True for motors to stop, from the motors (p, n) that move each pair.
+        """Return (n,) True for motors to stop, see the rules of this module.
 
         `mark_blocking_motors` in guard.c is the compiled version.
+
+        Args:
+            moves_pair: (p, n) True if a motor moves a colliding pair.
         """
-        arms = (moves_pair & (self._hand == 0)).any(axis=0)
-        sides = np.isin(self._side, self._side[arms]) | (self._side[arms] < 0).any()
-        return moves_pair.any(axis=0) | sides
+        is_moving_arm = (moves_pair & (self._is_hand_motor == 0)).any(axis=0)
+        stopped_sides = self._side_index[is_moving_arm]
+        is_trunk_moving = (stopped_sides < 0).any()
+        is_on_stopped_side = np.isin(self._side_index, stopped_sides) | is_trunk_moving
+        return moves_pair.any(axis=0) | is_on_stopped_side
 
     def _lacking_clearances(self, goal: Array) -> tuple[Array, Array]:
-        """Return the lacking clearances (o,) of the nearest pairs at a goal [m], and slopes (o, n).
+        """Return the lacking clearances of the nearest pairs at a goal (n,), and their slopes.
 
-        The lacking clearances are continuous functions of the goal, see `keep_away` of guard.c.
+        A pair lacks clearance below the avoidance distance. So that the lacking clearances are
+        continuous functions of the goal, they fade out as a pair becomes as distant as the nearest
+        omitted pair. `keep_away` of guard.c is the compiled version.
+
+        Returns:
+            (o,) lacking clearances [m], 0 or less: none; (o, n) gradients of the clearances [m per
+            rad or m].
         """
         if (guarding := self._compiled) is not None:
             guarding.goal[...] = goal
@@ -232,7 +250,8 @@ class Guard:
         order = np.argsort(distances[0], kind="stable")
         nearest, omitted = order[:OBSTACLES], order[OBSTACLES : OBSTACLES + 1]
         count, threshold = len(nearest), distances[0, omitted].min(initial=self._avoided)
-        share = (threshold - distances[0, nearest]) / (self._avoided - self._required)
-        lacking[:count] = np.maximum(share * (self._avoided - distances[0, nearest]), 0.0)
-        slopes[:count] = ((distances[1:, nearest] - distances[0, nearest]) / self.nudge).T
+        at_goal = distances[0, nearest]
+        fade_factor = (threshold - at_goal) / (self._avoided - self._required)
+        lacking[:count] = np.maximum(fade_factor * (self._avoided - at_goal), 0.0)
+        slopes[:count] = ((distances[1:, nearest] - at_goal) / self.nudge).T
         return lacking, slopes

@@ -18,11 +18,11 @@ from casadi_ik.kinematics.contacts import group_by_kinds
 from casadi_ik.model.grasp import Grasp
 from casadi_ik.model.pose import inverse
 from casadi_ik.model.targets import TargetBatch
-from casadi_ik.motion.approach import Approach, ApproachPlan, approach
+from casadi_ik.motion.approach import Approach, ApproachRequest, approach
+from casadi_ik.motion.cycle_runner import FollowerConfig
 from casadi_ik.motion.follower import Follower
-from casadi_ik.motion.inputs import FollowPlan
 from casadi_ik.motion.motion import direction_vector, length, rates_of, seconds, unbounded
-from casadi_ik.motion.reach import CarriedObject, Pace, Reach, ReachPlan, move, place, reach
+from casadi_ik.motion.reach import CarriedObject, Pace, Reach, ReachRequest, move, place, reach
 from casadi_ik.motion.track import PathTracker, Track, track
 from casadi_ik.solve.engine import Engine, SolveOptions
 from casadi_ik.solve.solution import SolvedGrasp
@@ -87,7 +87,7 @@ class MovingSolver:
         rates = rates_of(self.robot, velocity, acceleration)
         free_posture = start if posture is None else self._target_builder.start(posture, "posture")
         return Follower(
-            FollowPlan(
+            FollowerConfig(
                 self._target_builder,
                 self._engine.check,
                 self._engine.compiled,
@@ -161,7 +161,7 @@ class MovingSolver:
         travel = None
         if period is not None:
             travel = rates_of(self.robot, velocity, None).steps(seconds("period", period))[0]
-        tracker = PathTracker(self._path_plan(start, targets), kinds)
+        tracker = PathTracker(self._path_config(start, targets), kinds)
         return track(engine, targets, tracker, travel)
 
     def reach(
@@ -227,15 +227,15 @@ class MovingSolver:
         ):
             raise UnsupportedError(f"lift: {self.robot.name!r} has no arm that moves its palm")
         pace = self._pace(velocity, acceleration, period)
-        approach_plan = self._approach_plan(grasp, start, opening, distance, direction)
-        plan = ReachPlan(
-            approach_plan,
+        approach_request = self._approach_request(grasp, start, opening, distance, direction)
+        request = ReachRequest(
+            approach_request,
             pace,
             checked_integer(seed, "seed", 0),
-            np.clip(start, *approach_plan.plan.bounds),
+            np.clip(start, *approach_request.config.bounds),
         )
-        solutions = self._solutions(grasp, approach_plan.problem, start, seed, limit)
-        return reach(plan, *solutions, *lengths)
+        solutions = self._solutions(grasp, approach_request.problem, start, seed, limit)
+        return reach(request, *solutions, *lengths)
 
     def place(
         self,
@@ -310,21 +310,21 @@ class MovingSolver:
         hand = {name: float(q[self.robot.actuators.index(name)]) for name in motors}
         palm = Grasp(robot=grasp.robot, palm=motion @ self.robot.palm(q), posture=hand)
         target_grasp = replace(grasp.at(motion), pregrasp=None)
-        approach_plan = self._approach_plan(target_grasp, start, opening, distance, direction)
+        approach_request = self._approach_request(target_grasp, start, opening, distance, direction)
         carried_object = None
         if self._engine.check is not None:
             held_target = self._target_builder.from_grasps([grasp])
             carried_object = CarriedObject(self._engine.check, held_target, q)
         pace, height = self._pace(velocity, acceleration, period), length("lower", lower)
-        plan = ReachPlan(
-            approach_plan,
+        request = ReachRequest(
+            approach_request,
             pace,
             checked_integer(seed, "seed", 0),
-            np.clip(start, *approach_plan.plan.bounds),
+            np.clip(start, *approach_request.config.bounds),
         )
         problem = self._target_builder.from_grasps([palm])
         solutions = self._solutions(palm, problem, start, seed, limit)
-        return place(plan, *solutions, carried_object, height)
+        return place(request, *solutions, carried_object, height)
 
     def move(
         self,
@@ -415,28 +415,28 @@ class MovingSolver:
             (True, (14,))
         """
         start = self._target_builder.start(q0)
-        plan = self._approach_plan(grasp, start, opening, distance, direction)
-        return approach(plan, *self._solutions(grasp, plan.problem, start, seed, limit))
+        request = self._approach_request(grasp, start, opening, distance, direction)
+        return approach(request, *self._solutions(grasp, request.problem, start, seed, limit))
 
     def _pace(
         self, velocity: ArrayLike | None, acceleration: ArrayLike | None, period: float
     ) -> Pace:
         return Pace(rates_of(self.robot, velocity, acceleration), seconds("period", period))
 
-    def _approach_plan(
+    def _approach_request(
         self,
         grasp: Grasp | SolvedGrasp,
         start: Array,
         opening: float,
         distance: float,
         direction: ArrayLike | None,
-    ) -> ApproachPlan:
+    ) -> ApproachRequest:
         """Return the requirements of the approach to a grasp."""
         target: Any = grasp if isinstance(grasp, Grasp) else getattr(grasp, "grasp", grasp)
         problem = self._target_builder.from_grasps([target])
         pregrasp_palm = target.pregrasp and target.pregrasp.single_palm
-        return ApproachPlan(
-            self._path_plan(start),
+        return ApproachRequest(
+            self._path_config(start),
             problem,
             length("opening", opening),
             length("distance", distance),
@@ -470,11 +470,11 @@ class MovingSolver:
         solutions = [*best.q[best.success], *(item.q for item in alternatives)][:limit]
         return solutions, "" if solutions else "the grasp has no solution"
 
-    def _path_plan(self, q0: Array, targets: TargetBatch | None = None) -> FollowPlan:
+    def _path_config(self, q0: Array, targets: TargetBatch | None = None) -> FollowerConfig:
         """Return the configuration of the graph for paths, without limits of velocities."""
         bounds, rates = self._bounds(targets), unbounded(self.robot)
         check, compiled = self._engine.check, self._engine.compiled
-        return FollowPlan(
+        return FollowerConfig(
             self._target_builder,
             check,
             compiled,

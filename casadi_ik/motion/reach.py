@@ -21,7 +21,7 @@ from casadi_ik.model.pose import inverse
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.motion.approach import (
     ApproachAttempt,
-    ApproachPlan,
+    ApproachRequest,
     ReachStatus,
     approaches,
     hands_used,
@@ -197,7 +197,7 @@ class Pace:
 
 
 @dataclass(frozen=True, eq=False)
-class ReachPlan:
+class ReachRequest:
     """Requirements of a motion to a grasp.
 
     Attributes:
@@ -207,7 +207,7 @@ class ReachPlan:
         q0: (n,) initial posture.
     """
 
-    approach: ApproachPlan
+    approach: ApproachRequest
     pace: Pace
     seed: int
     q0: Array
@@ -215,7 +215,7 @@ class ReachPlan:
     @property
     def robot(self) -> ArmHand:
         """Robot of the approach."""
-        return self.approach.plan.robot
+        return self.approach.config.robot
 
 
 Segment = tuple[str, Array]
@@ -238,18 +238,18 @@ class _Stage:
 
 
 def reach(
-    plan: ReachPlan, solutions: Sequence[Array], reason: str, lift: float, retreat: float
+    request: ReachRequest, solutions: Sequence[Array], reason: str, lift: float, retreat: float
 ) -> Reach:
     """Plan a motion to the first reachable solution of a grasp.
 
     Args:
-        plan: Requirements.
+        request: Requirements.
         solutions: (n,) solutions of the grasp, best first.
         reason: Reason why there are no solutions.
         lift: Height by which the hand is lifted after it has closed [m].
         retreat: Length of the retreat along the reverse approach after that [m].
     """
-    check, problem, robot = plan.approach.plan.check, plan.approach.problem, plan.robot
+    check, problem, robot = request.approach.config.check, request.approach.problem, request.robot
 
     def plan_motion(attempt: ApproachAttempt) -> Reach:
         path = attempt.path
@@ -271,20 +271,20 @@ def reach(
                 return failed(ReachStatus.NO_RETREAT, f"{name} is not free: {reason}")
             segments.append((name, postures))
             q = postures[-1]
-        transfer, note = _plan_segments(plan, TRANSFER, path.coming[0], attempt.open_query)
+        transfer, note = _plan_segments(request, TRANSFER, path.coming[0], attempt.open_query)
         stages = (
             _Stage(transfer, attempt.open_query),
             _Stage([(APPROACH, path.coming)], attempt.coming_query),
             _Stage([(CLOSING, path.closing)], attempt.closing_query, counts=False),
             _Stage(segments, carried_object, counts=False),
         )
-        return _timed_motion(robot, stages, plan.pace, note, attempt.q, attempt.number)
+        return _timed_motion(robot, stages, request.pace, note, attempt.q, attempt.number)
 
-    return _first_motion(plan, solutions, reason, plan_motion)
+    return _first_motion(request, solutions, reason, plan_motion)
 
 
 def place(
-    plan: ReachPlan,
+    request: ReachRequest,
     solutions: Sequence[Array],
     reason: str,
     carried_object: CarriedObject | None,
@@ -293,7 +293,7 @@ def place(
     """Plan a motion that places the object in the hand, for the first solution that permits it.
 
     Args:
-        plan: Requirements; the hand leaves the object along the reverse approach.
+        request: Requirements; the hand leaves the object along the reverse approach.
         solutions: (n,) postures in which the object has its target pose, best first.
         reason: Reason why there are no solutions.
         carried_object: Collision checks of robot and object; None checks nothing.
@@ -311,15 +311,15 @@ def place(
         down = up[::-1]
         if carried_object is not None and (obstruction := carried_object.path_obstruction(down)):
             return failed(ReachStatus.NO_APPROACH, f"the path down is not free: {obstruction}")
-        carrying, note = _plan_segments(plan, CARRYING, down[0], carried_object)
+        carrying, note = _plan_segments(request, CARRYING, down[0], carried_object)
         stages = (
             _Stage([*carrying, (LOWERING, down)] if carrying else [], carried_object, counts=False),
             _Stage([(OPENING, path.closing[::-1])], attempt.closing_query, counts=False),
             _Stage([(LEAVING, path.coming[::-1])], attempt.coming_query),
         )
-        return _timed_motion(plan.robot, stages, plan.pace, note, attempt.q, attempt.number)
+        return _timed_motion(request.robot, stages, request.pace, note, attempt.q, attempt.number)
 
-    return _first_motion(plan, solutions, reason, plan_motion)
+    return _first_motion(request, solutions, reason, plan_motion)
 
 
 def move(
@@ -344,7 +344,7 @@ def move(
 
 
 def _first_motion(
-    plan: ReachPlan,
+    request: ReachRequest,
     solutions: Sequence[Array],
     reason: str,
     plan_motion: Callable[[ApproachAttempt], Reach],
@@ -353,7 +353,7 @@ def _first_motion(
     if not solutions:
         return failed(ReachStatus.NOT_SOLVED, reason)
     failures: list[Reach] = []
-    for attempt in approaches(plan.approach, solutions):
+    for attempt in approaches(request.approach, solutions):
         result = plan_motion(attempt)
         if result.success:
             return result
@@ -364,10 +364,10 @@ def _first_motion(
 
 
 def _plan_segments(
-    plan: ReachPlan, name: str, end: Array, query: CollisionQuery | CarriedObject | None
+    request: ReachRequest, name: str, end: Array, query: CollisionQuery | CarriedObject | None
 ) -> tuple[list[Segment], str]:
     """Return the segments of a free path from q0, and how it was planned or the failure."""
-    corners, note = plan_path(plan.robot, plan.q0, end, query, plan.seed)
+    corners, note = plan_path(request.robot, request.q0, end, query, request.seed)
     return _segments(name, corners), note if corners is None else f"path: {note}"
 
 

@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 
 from casadi_ik.files.arrays import Array
+from casadi_ik.motion.cycle import StateFields
+from casadi_ik.motion.cycle_runner import CycleRunner
 from casadi_ik.motion.guard import Guard, braked
-from casadi_ik.motion.inputs import FollowerInputs
 from casadi_ik.solve.verdict import TOLERANCE_SLACK
 
 SPACING = 0.1
@@ -104,7 +105,7 @@ class Recovery:
             guard: Collision checks of lines; None: all lines are free.
         """
         self._units, self._max_step, self._max_change = units, max_step, max_change
-        self._guard = guard
+        self._guard, self._fields = guard, StateFields.of(len(units))
         self._longest_step = float((max_step / units).max())
         self._min_check_cycles = max(math.floor(CHECK_PERIOD / period), 1)
         self._patience_cycles = math.ceil(PATIENCE / period)
@@ -132,24 +133,23 @@ class Recovery:
         """Return the next step (n,) of motors that return; None if they follow the contacts.
 
         Args:
-            state: State of the cycle (`Cycle.state`): positions (n,), last step (n,), ...
+            state: State of the cycle (`Cycle.state`).
         """
         if not self._is_returning:
             return None
-        n = len(self._units)
         if not self._has_line:
-            return braked(state[n : 2 * n], self._max_change)
+            return braked(state[self._fields.last_step], self._max_change)
         remaining = max(1.0 - self._fraction, 0.0)
         limit = min(self._max_fraction_step, self._fraction_step + self._max_fraction_change)
         self._next_fraction_step = min(limit, brake(remaining, self._max_fraction_change))
         next_fraction = self._fraction + self._next_fraction_step
-        return self._line_start + next_fraction * self._line - state[:n]
+        return self._line_start + next_fraction * self._line - state[self._fields.q]
 
-    def update(self, inputs: FollowerInputs, q: Array, last_step: Array, is_stopped: bool) -> None:
+    def update(self, runner: CycleRunner, q: Array, last_step: Array, is_stopped: bool) -> None:
         """Evaluate the result of a cycle.
 
         Args:
-            inputs: Graph of the cycle after its step.
+            runner: Graph of the cycle after its step.
             q: (n,) positions of the motors.
             last_step: (n,) their last step.
             is_stopped: True if the guard has stopped motors.
@@ -160,11 +160,11 @@ class Recovery:
         self._cycles_until_check -= 1
         if self._cycles_until_check <= 0:
             self._extend_trail(q)
-        error_ratio = inputs.error_ratio
-        is_missed = error_ratio > MAX_MET_RATIO and inputs.goal_error_ratio > MAX_MET_RATIO
+        error_ratio = runner.error_ratio
+        is_missed = error_ratio > MAX_MET_RATIO and runner.goal_error_ratio > MAX_MET_RATIO
         if is_stopped or is_missed:
             if self._has_met_contacts:
-                self._check_progress(inputs, error_ratio, q if is_stopped else None)
+                self._check_progress(runner, error_ratio, q if is_stopped else None)
         else:
             self._has_met_contacts = True
             if self._progress_ratio < math.inf:
@@ -206,12 +206,12 @@ class Recovery:
         self._cycles_until_check = max(cycles, self._min_check_cycles)
 
     def _check_progress(
-        self, inputs: FollowerInputs, error_ratio: float, stopped_q: Array | None
+        self, runner: CycleRunner, error_ratio: float, stopped_q: Array | None
     ) -> None:
         """Compare postures of the trail once the error has not decreased for a while.
 
         Args:
-            inputs: Graph of the cycle after its step.
+            runner: Graph of the cycle after its step.
             error_ratio: Error ratio after the step of the graph.
             stopped_q: (n,) positions of the motors if the guard has replaced that step; else None.
         """
@@ -222,11 +222,11 @@ class Recovery:
         if self._cycles_stuck <= self._patience_cycles:
             return
         if self._candidate < 0:
-            if stopped_q is not None and inputs.exact_error_ratio(stopped_q) <= MAX_MET_RATIO:
+            if stopped_q is not None and runner.exact_error_ratio(stopped_q) <= MAX_MET_RATIO:
                 self._restart_progress_clock(math.inf)
                 return
             self._candidate, self._best_ratio = self._trail_length - 1, math.inf
-        self._compare_postures(inputs)
+        self._compare_postures(runner)
         if self._candidate < 0:
             self._restart_progress_clock(error_ratio)
             self._is_returning = bool(self._best_ratio < GAIN * error_ratio)
@@ -234,10 +234,10 @@ class Recovery:
             self._needs_clearance = False
             self._line_end = -1
 
-    def _compare_postures(self, inputs: FollowerInputs) -> None:
+    def _compare_postures(self, runner: CycleRunner) -> None:
         """Compare the next postures of the trail with the target, from its end to its start."""
         for _ in range(min(self._comparisons_per_cycle, self._candidate + 1)):
-            error_ratio = inputs.error_ratio_at(self._trail[self._candidate])
+            error_ratio = runner.error_ratio_at(self._trail[self._candidate])
             if error_ratio < GAIN * self._best_ratio:
                 self._best_ratio, self._destination = error_ratio, self._candidate
             self._candidate -= 1

@@ -14,9 +14,9 @@ from casadi_ik.collision.clearance_kernel import OBSTACLES
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.kinematics.contacts import Kinds
 from casadi_ik.model.targets import TargetBatch
+from casadi_ik.motion.cycle_runner import CycleRunner, FollowerConfig, contact_rows, tolerance_rows
 from casadi_ik.motion.free_path import check_path
 from casadi_ik.motion.guard import Guard
-from casadi_ik.motion.inputs import FollowerInputs, FollowPlan, contact_rows, tolerance_rows
 from casadi_ik.solve.engine import Engine
 from casadi_ik.solve.verdict import judge
 
@@ -80,15 +80,15 @@ class PathTracker:
         n: Number of motors.
     """
 
-    def __init__(self, plan: FollowPlan, kinds: Kinds) -> None:
+    def __init__(self, config: FollowerConfig, kinds: Kinds) -> None:
         """Compile the graph unless it is cached."""
-        self._guard = None if plan.check is None else Guard(plan)
-        self._inputs = FollowerInputs(plan, kinds, 0 if self._guard is None else OBSTACLES)
-        self.n = len(plan.robot.actuators)
+        self._guard = None if config.check is None else Guard(config)
+        self._runner = CycleRunner(config, kinds, 0 if self._guard is None else OBSTACLES)
+        self.n = len(config.robot.actuators)
 
     def state_at(self, q: Array) -> Array:
         """Return the state of rest at a posture (n,)."""
-        return self._inputs.state_at(q)
+        return self._runner.state_at(q)
 
     def walk(self, state: Array, targets: TargetBatch) -> Array:
         """Track targets, `TrackTuning.cycles` cycles each.
@@ -101,21 +101,21 @@ class PathTracker:
             (k, ...) states after each target (`Cycle.state`); they begin with the positions of the
             motors, their last step, and the goal.
         """
-        inputs, guard = self._inputs, self._guard
-        values = contact_rows(inputs.cycle, targets) | tolerance_rows(targets.tolerances)
-        rows = inputs.rows(len(targets), values)
+        runner, guard = self._runner, self._guard
+        values = contact_rows(runner.cycle, targets) | tolerance_rows(targets.tolerances)
+        rows = runner.rows(len(targets), values)
         if guard is None:
-            return inputs.run.run(state, np.repeat(rows, TRACK_TUNING.cycles, axis=0))[0][
+            return runner.recurrence.run(state, np.repeat(rows, TRACK_TUNING.cycles, axis=0))[0][
                 TRACK_TUNING.cycles - 1 :: TRACK_TUNING.cycles
             ]
-        inputs.run.state[:] = state
+        runner.recurrence.state[:] = state
         states = np.empty((len(rows), len(state)))
         for i, row in enumerate(rows):
-            inputs.run.parameters[:] = row
+            runner.recurrence.parameters[:] = row
             guard.set_target(targets.rows(slice(i, i + 1)))
             for _ in range(TRACK_TUNING.cycles):
-                guard.step(inputs)
-            states[i] = inputs.run.state
+                guard.step(runner)
+            states[i] = runner.recurrence.state
         return states
 
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from casadi_ik.motion.cycle_runner import CycleRunner
 from casadi_ik.motion.guard import Guard
-from casadi_ik.motion.inputs import FollowerInputs
 from casadi_ik.motion.recovery import CAPACITY, CHECKS, Recovery
 
 PERIOD = 0.01
@@ -27,7 +27,7 @@ class CountingGuard(Guard):
         return q
 
 
-class CountingInputs(FollowerInputs):
+class CountingInputs(CycleRunner):
     """Graph of a cycle that misses its target by the distance from 0; it counts evaluations."""
 
     def __init__(self) -> None:

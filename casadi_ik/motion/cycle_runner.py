@@ -1,4 +1,4 @@
-"""Configuration of a follower, and its inputs in a cycle."""
+"""Configuration of a follower, and evaluation of its cycles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.kinematics.contacts import LENGTH, Kinds
 from casadi_ik.model.targets import TargetBatch, Tolerance
-from casadi_ik.motion.cycle import Cycle, side_name
+from casadi_ik.motion.cycle import Cycle, StateFields, side_name
 from casadi_ik.motion.motion import Rates
 from casadi_ik.solve.target_builder import TargetBuilder
 from casadi_ik.solve.verdict import deviations
@@ -26,7 +26,7 @@ ERROR_TIME = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class FollowPlan:
+class FollowerConfig:
     """Configuration of a follower.
 
     Attributes:
@@ -36,11 +36,12 @@ class FollowPlan:
         q0: (n,) initial positions of the motors [rad or m].
         bounds: (n,) lower and upper limits; they are equal for fixed motors.
         period: Time from cycle to cycle [s].
-        rates: Limits of velocities and accelerations.
+        rates: Limits of velocities and accelerations of the motors.
         posture: (n,) posture to which free motions lead [rad or m].
         settling: Time constant of free motions [s]; infinite: no free motion.
         pull: Weight of the anchor, see `Cycle`.
-        nearest: Search for the configuration (n,) nearest to a target, given a start (n,).
+        nearest: Function (target, start (n,)) that searches for the configuration (n,) with the
+            smallest error, and of several such configurations for the one nearest to the start.
     """
 
     target_builder: TargetBuilder
@@ -62,9 +63,10 @@ class FollowPlan:
 
     @property
     def cycle_parameters(self) -> dict[str, float]:
-        """Decay of free motions and of errors from cycle to cycle, as parameters of a cycle.
+        """Parameters of a cycle that govern free motions and errors (`Cycle.parameters`).
 
-        Free motions are the response of a critically damped spring between motors and posture.
+        Free motions are the response of a critically damped spring between motors and posture:
+        with the decay d per cycle, momentum d^2 and spring (1 - d)^2 give a double pole at d.
         """
         if math.isinf(self.settling):
             return {"pull": self.pull, "momentum": 0.0, "spring": 0.0, "error_decay": 0.0}
@@ -77,40 +79,49 @@ class FollowPlan:
         }
 
 
-POINTS_AND_NORMALS, POINTS_ONLY = "points and normals", "points"
-"""Inputs of all fingers for which the weights are set already."""
-
 UNUSED_NORMAL = (1.0, 0.0, 0.0)
 """Placeholder of a free normal: graphs divide by its length."""
 
 
-class FollowerInputs:
-    """Graph of a cycle for contacts of given kinds, and its memory.
+class CycleRunner:
+    """Evaluator of the graph of a cycle for contacts of given kinds.
 
     Attributes:
-        run: Graph that is evaluated step by step.
-        views: Its parameters by name; callers write into them.
-        record: Results of its last step by name.
+        cycle: Cycle that defines the graph and its layouts.
+        recurrence: Graph with its memory, evaluated cycle by cycle.
+        parameters: Parameters of the next cycle by name; callers write into these views.
+        record: Results of the last cycle by name.
+        fields: Positions of the fields of the state.
     """
 
-    def __init__(self, plan: FollowPlan, kinds: Kinds, obstacles: int) -> None:
-        """Compile the graph unless it is cached."""
-        self._robot = plan.robot
-        self.cycle = cycle = Cycle(plan.robot.description, kinds, obstacles)
-        self.run = Recurrence(FunctionKernel(cycle.graph, plan.compiled))
-        self.views: dict[str, Array] = cycle.parameters.unpack(self.run.parameters)
-        self.record: dict[str, Array] = cycle.record.unpack(self.run.record)
-        max_step, max_change = plan.rates.steps(plan.period)
-        self._bounds = plan.bounds
-        self._fill(lower=plan.bounds[0], upper=plan.bounds[1], posture=plan.posture)
+    def __init__(self, config: FollowerConfig, kinds: Kinds, obstacles: int) -> None:
+        """Compile the graph unless it is cached.
+
+        Args:
+            config: Configuration of the follower.
+            kinds: Kind of contact by finger.
+            obstacles: Number of clearances in the least squares.
+        """
+        self._robot = config.robot
+        self.fields = StateFields.of(len(config.robot.actuators))
+        self.cycle = cycle = Cycle(config.robot.description, kinds, obstacles)
+        self.recurrence = Recurrence(FunctionKernel(cycle.graph, config.compiled))
+        self.parameters: dict[str, Array] = cycle.parameters.unpack(self.recurrence.parameters)
+        self.record: dict[str, Array] = cycle.record.unpack(self.recurrence.record)
+        max_step, max_change = config.rates.steps(config.period)
+        self._bounds = config.bounds
+        self._fill(lower=config.bounds[0], upper=config.bounds[1], posture=config.posture)
         self._fill(max_step=max_step, max_change=max_change)
-        tolerances = tuple(plan.target_builder.tolerances.values())
+        tolerances = tuple(config.target_builder.tolerances.values())
         self._weights, self._tolerances = contact_weights(tolerances), tolerance_rows(tolerances)
-        self._fill(**plan.cycle_parameters)
-        names = "error_ratio", "goal_error_ratio"
-        self._ratios = tuple(cycle.record.slice(name).start for name in names)
-        self._points, self._normals = self.views["points"], self.views["normals"]
-        self._mode = ""
+        self._fill(**config.cycle_parameters)
+        self._error_ratio_index = cycle.record.slice("error_ratio").start
+        self._goal_error_ratio_index = cycle.record.slice("goal_error_ratio").start
+        self._checksum_index = cycle.record.slice("checksum").start
+        self._points, self._normals = self.parameters["points"], self.parameters["normals"]
+        # Contacts of all fingers for which the weights are set already, with or without normals;
+        # None: other weights.
+        self._weights_have_normals: bool | None = None
 
     def state_at(self, q: Array) -> Array:
         """Return the state of rest at a posture (n,)."""
@@ -119,24 +130,24 @@ class FollowerInputs:
 
     def _fill(self, **values: ArrayLike) -> None:
         for name, value in values.items():
-            self.views[name][...] = value
+            self.parameters[name][...] = value
 
     def rows(self, count: int, values: Mapping[str, ArrayLike]) -> Array:
-        """Return the parameters (count, ...) of several cycles.
+        """Return the parameters (count, p) of several cycles for `Recurrence.run`.
 
         Args:
             count: Number of cycles.
             values: (count, ...) by name, or one value for all cycles; other parameters keep their
                 present values.
         """
-        rows = np.repeat(self.run.parameters[None], count, axis=0)
+        rows = np.repeat(self.recurrence.parameters[None], count, axis=0)
         for name, value in values.items():
             columns = rows[:, self.cycle.parameters.slice(name)]
             columns[...] = np.reshape(value, (-1, columns.shape[1]))
         return rows
 
     def set_contacts(self, points: Array, normals: Array | None) -> None:
-        """Set contacts of all fingers; `is_finite` is their validity after the step.
+        """Set contacts of all fingers without checks; `is_finite` tells later if they were valid.
 
         Args:
             points: (f, 3) [m].
@@ -145,18 +156,19 @@ class FollowerInputs:
         self._points[...] = points
         if normals is not None:
             self._normals[...] = normals
-        mode = POINTS_AND_NORMALS if normals is not None else POINTS_ONLY
-        if self._mode != mode:
-            is_set = np.array([1.0, normals is not None])
+        has_normals = normals is not None
+        # Weights and tolerances are written only when they change, because each write takes time.
+        if self._weights_have_normals is not has_normals:
+            is_set = np.array([1.0, has_normals])
             self._fill(weights=is_set * self._weights, **self._tolerances)
-            if normals is None:
+            if not has_normals:
                 self._normals[...] = UNUSED_NORMAL
-            self._mode = mode
+            self._weights_have_normals = has_normals
 
     @property
     def is_finite(self) -> bool:
         """True if the target of the last step was finite and no normal was zero."""
-        return math.isfinite(self.run.record[-1])
+        return math.isfinite(self.recurrence.record[self._checksum_index])
 
     def set_partial_contacts(self, points: Array, normals: Array) -> str:
         """Set contacts that may be partly free.
@@ -171,7 +183,7 @@ class FollowerInputs:
         reason = invalid_frame_reason(points, normals)
         if reason:
             return reason
-        self._mode = ""
+        self._weights_have_normals = None
         is_set = ~np.isnan(np.stack([points[:, 0], normals[:, 0]], axis=1))
         normals = np.where(is_set[:, 1:], normals, UNUSED_NORMAL)
         self._fill(points=np.nan_to_num(points), normals=normals)
@@ -179,14 +191,19 @@ class FollowerInputs:
         return ""
 
     def set_target(self, problem: TargetBatch) -> None:
-        """Set one target of the graph's kinds of contacts, checked before."""
-        self._mode = ""
+        """Set a batch of one valid target of the graph's kinds of contacts."""
+        self._weights_have_normals = None
         rows = contact_rows(self.cycle, problem)
         self._fill(**{name: values[0] for name, values in rows.items()})
         self._fill(**tolerance_rows(problem.tolerances))
 
     def set_palms(self, poses: Mapping[str | None, Array], weight: tuple[float, float]) -> None:
-        """Set target poses (4, 4) of palms by side, which have a lower priority than contacts."""
+        """Set target poses of palms, which have a lower priority than contacts.
+
+        Args:
+            poses: (4, 4) pose by side, base frame; the side is None for a single arm-hand.
+            weight: Weights of position and axes relative to a contact.
+        """
         for side, pose in poses.items():
             values = {"point": pose[:3, 3], "axes": pose[:3, :3], "weight": weight}
             self._fill(**{side_name(f"palm_{name}", side): value for name, value in values.items()})
@@ -197,12 +214,13 @@ class FollowerInputs:
             self._fill(**{side_name("palm_weight", side): 0.0})
 
     def exact_error_ratio(self, q: Array) -> float:
-        """Return the maximum error relative to the tolerance of the target at a posture (n,)."""
-        max_step = self.views["max_step"]
-        values = max_step.copy()
+        """Return the `error_ratio` of the present target at a posture (n,) itself."""
+        # Without a step the graph measures the posture at which it starts.
+        max_step = self.parameters["max_step"]
+        previous_max_step = max_step.copy()
         max_step[...] = 0.0
         ratio = self.error_ratio_at(q)
-        max_step[...] = values
+        max_step[...] = previous_max_step
         return ratio
 
     def errors(self, q: Array) -> tuple[Array, Array]:
@@ -211,19 +229,24 @@ class FollowerInputs:
         return position[0], angle[0]
 
     def target(self) -> TargetBatch:
-        """Return the contacts of the present target, NaN where free."""
-        weights = self.views["weights"]
+        """Return the contacts of the present target, NaN where free, as a batch of one."""
+        weights = self.parameters["weights"]
 
-        def target(name: str, is_set: Bools) -> Array:
-            return np.where(is_set[:, None], self.views[name], np.nan)[None]
+        def vectors(name: str, is_set: Bools) -> Array:
+            return np.where(is_set[:, None], self.parameters[name], np.nan)[None]
 
+        # Points and normals are the first two vectors of a contact; unused extra vectors are zero.
+        extra_names = [f"{name}s" for name in self.cycle.contacts.data[2:]]
         extra_vectors = {
-            f"{name}s": target(f"{name}s", np.any(self.views[f"{name}s"], axis=1))
-            for name in self.cycle.contacts.data[2:]
+            name: vectors(name, np.any(self.parameters[name], axis=1)) for name in extra_names
         }
-        points, normals = target("points", weights[:, 0] > 0), target("normals", weights[:, 1] > 0)
+        points = vectors("points", weights[:, 0] > 0)
+        normals = vectors("normals", weights[:, 1] > 0)
         normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-        limits = self.views["position_tolerance"].tolist(), self.views["angle_tolerance"].tolist()
+        limits = (
+            self.parameters["position_tolerance"].tolist(),
+            self.parameters["angle_tolerance"].tolist(),
+        )
         tolerances = tuple(map(Tolerance, *limits))
         return TargetBatch(
             points, normals, tolerances, enforce_limits=True, extra_vectors=extra_vectors
@@ -232,20 +255,23 @@ class FollowerInputs:
     @property
     def error_ratio(self) -> float:
         """Largest error of the motors over its tolerance in the last step."""
-        return float(self.run.record[self._ratios[0]])
+        return float(self.recurrence.record[self._error_ratio_index])
 
     @property
     def goal_error_ratio(self) -> float:
         """Largest error of the goal over its tolerance in the last step."""
-        return float(self.run.record[self._ratios[1]])
+        return float(self.recurrence.record[self._goal_error_ratio_index])
 
     def error_ratio_at(self, q: Array) -> float:
-        """Return the `error_ratio` of the present target after one step from a posture (n,)."""
-        state, record = self.run.state.copy(), self.run.record.copy()
+        """Return the `error_ratio` of the present target after one step from a posture (n,).
+
+        State and record do not change.
+        """
+        state, record = self.recurrence.state.copy(), self.recurrence.record.copy()
         self.step_from_rest(q)
         ratio = self.error_ratio
-        self.run.back()
-        self.run.state[:], self.run.record[:] = state, record
+        self.recurrence.back()
+        self.recurrence.state[:], self.recurrence.record[:] = state, record
         return ratio
 
     def step_from_rest(self, q: Array) -> Array:
@@ -254,21 +280,23 @@ class FollowerInputs:
         Returns:
             New state.
         """
-        n, state = len(q), self.run.state
-        state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n :] = q, 0.0, q, 0.0
-        return self.run.step()
+        state, fields = self.recurrence.state, self.fields
+        state[fields.q], state[fields.last_step], state[fields.goal] = q, 0.0, q
+        state[fields.locked_on :] = 0.0
+        return self.recurrence.step()
 
     def step_by(self, step: Array) -> Array:
-        """Make a given step (n,) of the motors instead of one to the contacts.
+        """Make a given step (n,) of the motors instead of one towards the contacts.
 
         Returns:
-            New state.
+            New state; the record describes the step that the graph makes from there.
         """
-        n, previous = len(step), self.run.state.copy()
-        q = clip_step(previous[:n], step, self._bounds)
+        fields, previous = self.fields, self.recurrence.state.copy()
+        q = clip_step(previous[fields.q], step, self._bounds)
         state = self.step_from_rest(q)
-        state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n] = q, step, q, 0.0
-        self.run.previous_state[:] = previous
+        state[fields.q], state[fields.last_step], state[fields.goal] = q, step, q
+        state[fields.locked_on] = 0.0
+        self.recurrence.previous_state[:] = previous
         return state
 
     def set_bounds(self, lower: Array, upper: Array) -> None:
@@ -281,7 +309,7 @@ class FollowerInputs:
 
     def clear_target(self) -> None:
         """Remove contacts and palm poses, so that the goal does not move."""
-        self._mode = ""
+        self._weights_have_normals = None
         self._fill(points=0.0, normals=UNUSED_NORMAL, weights=0.0)
         self.clear_palms()
 
@@ -298,7 +326,10 @@ def clip_step(q: Array, step: Array, bounds: tuple[Array, Array]) -> Array:
 
 
 def contact_weights(tolerances: tuple[Tolerance, ...]) -> Array:
-    """Return the weights (f, 2) of points and normals: inverse tolerances, the largest is 1."""
+    """Return the weights (f, 2) of points and normals: inverse tolerances.
+
+    The largest weight is 1. Position tolerances are divided by `LENGTH`, as residuals are.
+    """
     limits = np.array([(item.position / LENGTH, item.angle) for item in tolerances])
     return limits.min() / limits
 
