@@ -74,9 +74,10 @@ class SolveOptions:
 
         Raises:
             UnknownNameError: The robot does not have a finger with weights.
+            InputError: The posture has another number of motors.
         """
         if isinstance(self.best_effort, BestEffort):
-            self.best_effort.check(robot.fingers)
+            self.best_effort.check(robot.fingers, len(robot.actuators))
 
 
 REQUIRED_ARRAYS = ("points", "normals")

@@ -260,6 +260,7 @@ class NearestSearch:
         options: BestEffort,
     ) -> NearestMinima:
         """Return nearest configurations as options require; for the arguments see `find`."""
+        targets = options.start(targets)
         tolerances = options.tolerances(targets, self._trials.robot.fingers)
         if not options.local:
             minima = self.find(targets, last_q, query, tolerances)

@@ -163,6 +163,43 @@ def test_equally_near_configurations_are_decided_by_travel():
         np.testing.assert_allclose(restarted.q, solution.q, atol=1e-4)
 
 
+def test_equally_near_configurations_are_decided_by_a_posture():
+    """The rotation of the first joint does not matter for a point above the axis of the base."""
+    robot = ik.load_robot("ur5e")
+    solver = ik.Solver(robot)
+    grasp = ik.Grasp({robot.fingers[0]: ik.Contact([0.0, 0.0, 3.0])})
+    nearest = solver.solve(grasp, diagnose=False, best_effort=True)
+    for angle in (-1.0, 2.0):
+        posture = nearest.q.copy()
+        posture[0] = angle
+        options = ik.BestEffort(posture=posture)
+        solution = solver.solve(grasp, diagnose=False, best_effort=options)
+        assert solution.status is ik.Status.NEAREST
+        assert solution.q[0] == pytest.approx(angle, abs=1e-3)
+        assert solution.error_ratio == pytest.approx(nearest.error_ratio)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"weights": [1.0, 2.0]},
+        {"minimax": "yes"},
+        {"posture": [0.0, np.nan]},
+        {"posture": "home"},
+        {"posture": [0.0], "local": True},
+    ],
+)
+def test_invalid_options_are_refused(options):
+    with pytest.raises(ik.errors.InputError, match=next(iter(options))):
+        ik.BestEffort(**options)
+
+
+def test_posture_of_another_robot_is_refused(robot):
+    options = ik.BestEffort(posture=[0.0, 0.0])
+    with pytest.raises(ik.errors.InputError, match=f"posture.*2.*{len(robot.actuators)}"):
+        ik.Solver(robot).solve_batch(*robot.contacts(robot.home[None]), best_effort=options)
+
+
 def test_nearest_configurations_do_not_need_a_compiler():
     robot = ik.load_robot("ur5e")
     points, normals = out_of_reach(robot, 4, factor=2.5)
