@@ -275,7 +275,11 @@ def reasons(solution: Solution) -> list[str]:
         lines += [touches, *remedies]
     if solution.diagnosis is not None:
         lines += solution.diagnosis.lines
-    return lines or [FAILURE_TEXTS.get(solution.status, "not met").format(target)]
+    if not lines:
+        lines.append(FAILURE_TEXTS.get(solution.status, "not met").format(target))
+    if solution.status is Status.NEAREST and solution.palm is None:
+        lines.append(f"the largest error is {solution.error_ratio:.3g} times its tolerance")
+    return lines
 
 
 def _wrapped_pairs(pairs: Iterable[str]) -> list[str]:

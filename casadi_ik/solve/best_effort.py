@@ -145,4 +145,4 @@ def _checked_posture(posture: object) -> tuple[float, ...]:
         array = np.zeros(())
     if array.ndim != 1 or not np.isfinite(array).all():
         raise InputError(f"posture: found {posture!r}, expected a finite number per motor")
-    return tuple(array.tolist())
+    return tuple(float(position) for position in array)

@@ -282,4 +282,8 @@ def test_best_effort_writes_the_nearest_configuration(run: Command, tmp_path: Pa
         report = json.loads(out.read_text())
         assert report["status"] == status
         errors[status] = max(item["position_error"] for item in report["contacts"].values())
+        if status == "NEAREST":
+            ratio = re.search(r"([\d.]+) times its tolerance", done.out)
+            assert ratio is not None
+            assert float(ratio[1]) >= 0.99 * errors[status] / 5e-3
     assert errors["NEAREST"] < errors["STALLED"]
