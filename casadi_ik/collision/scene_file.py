@@ -93,7 +93,8 @@ class ObstacleEntry(
             raise DescriptionError(f"{location}: found {' and '.join(keys)}, expected one of them")
         if self.pose is not None:
             return single_pose(self.pose, f"{location}.pose")
-        pose = frame_matrix(Frame(self.xyz or (0.0, 0.0, 0.0), self.rpy or (0.0, 0.0, 0.0)))
+        frame = Frame(self.xyz or (0.0, 0.0, 0.0), self.rpy or (0.0, 0.0, 0.0))
+        pose = frame_matrix(frame, location)
         for key, shift in (("quaternion_wxyz", 0), ("quaternion_xyzw", 1)):
             quaternion = getattr(self, key)
             if quaternion is not None:

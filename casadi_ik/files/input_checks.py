@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 import operator
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -167,6 +167,8 @@ class UsualSizes:
         mesh: Edge of the box around a mesh [m].
         position: Tolerance of a contact point [m].
         angle: Tolerance of a normal [rad].
+        joint_offset: Distance of a joint from its parent [m].
+        joint_limit: Limit of a revolute joint [rad].
     """
 
     contact: float = 10.0
@@ -175,7 +177,12 @@ class UsualSizes:
     mesh: float = 10.0
     position: float = 0.1
     angle: float = math.radians(30.0)
+    joint_offset: float = 10.0
+    joint_limit: float = 30.0
 
+
+MAX_DEGREES = 720.0
+"""Largest limit of a joint that may be meant in degrees; larger ones stand for none."""
 
 USUAL_SIZES = UsualSizes()
 
@@ -236,6 +243,50 @@ def warn_of_wide_tolerance(position: float, angle: float, location: str = "toler
             f"{location}.angle: found {angle:g} rad ({math.degrees(angle):.4g} deg); expected "
             f"at most {USUAL_SIZES.angle:.3g} rad (30 deg; a number in degrees? use "
             f"np.deg2rad({angle:g}))"
+        )
+
+
+def warn_of_angles(angles: Sequence[float], location: str) -> None:
+    """Warn of angles of a rotation of more than a turn, which are probably in degrees.
+
+    Args:
+        angles: Angles [rad].
+        location: Name of the argument, or file and key.
+    """
+    largest = max(map(abs, angles), default=0.0)
+    if largest > math.tau * (1 + ROUNDING_MARGIN):
+        _warn(
+            f"{location}: found an angle of {largest:.4g} rad; expected at most {math.tau:.4g} "
+            f"rad, a turn (numbers in degrees? multiply by {math.radians(1):.7g})"
+        )
+
+
+def warn_of_joint_offset(offset: float, location: str) -> None:
+    """Warn of a joint that is more than `UsualSizes.joint_offset` from its parent.
+
+    Args:
+        offset: Distance of the joint [m].
+        location: File and joint.
+    """
+    if offset > USUAL_SIZES.joint_offset:
+        _warn(
+            f"{location}: the joint is {offset:.4g} m from its parent; expected at most "
+            f"{USUAL_SIZES.joint_offset:g} m (numbers in mm? 1 mm is 0.001)"
+        )
+
+
+def warn_of_joint_limit(limit: float, location: str) -> None:
+    """Warn of a limit between `UsualSizes.joint_limit` and `MAX_DEGREES`.
+
+    Args:
+        limit: Limit of a revolute joint [rad].
+        location: File and joint.
+    """
+    if USUAL_SIZES.joint_limit < limit <= MAX_DEGREES:
+        _warn(
+            f"{location}: found a limit of {limit:.4g} rad; expected at most "
+            f"{USUAL_SIZES.joint_limit:g} rad (numbers in degrees? multiply by "
+            f"{math.radians(1):.7g})"
         )
 
 

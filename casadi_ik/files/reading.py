@@ -17,6 +17,7 @@ from yaml.composer import ComposerError
 
 from casadi_ik.errors import DescriptionError
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks import warn_of_angles
 from casadi_ik.files.limits import LIMITS
 from casadi_ik.files.units import (
     QUANTITY,
@@ -200,8 +201,15 @@ class Frame(Struct, frozen=True):
     rpy: Angles = (0.0, 0.0, 0.0)
 
 
-def frame_matrix(frame: Frame) -> Array:
-    """Return the pose (4, 4) of a frame: rotation rpy about fixed axes, then translation xyz."""
+def frame_matrix(frame: Frame, location: str = "") -> Array:
+    """Return the pose (4, 4) of a frame: rotation rpy about fixed axes, then translation xyz.
+
+    Args:
+        frame: The frame.
+        location: File and key; with them, angles that are probably in degrees cause a warning.
+    """
+    if location:
+        warn_of_angles(frame.rpy, f"{location}.rpy")
     roll, pitch, yaw = frame.rpy
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)

@@ -131,6 +131,7 @@ def grasp_from_entry(entry: GraspFile, path: Path, name: str, key_prefix: str = 
         DescriptionError: A contact is malformed.
     """
     contacts: dict[str, Contact] = {}
+    location = f"{path}: {key_prefix}"
     for finger, contact in entry.contacts.items():
         try:
             contacts[finger] = _contact(contact)
@@ -142,20 +143,25 @@ def grasp_from_entry(entry: GraspFile, path: Path, name: str, key_prefix: str = 
             robot=entry.robot,
             name=name,
             object=entry.object.name if entry.object else "",
-            object_pose=frame_matrix(entry.object.pose) if entry.object else None,
+            object_pose=frame_matrix(entry.object.pose, f"{location}object.pose")
+            if entry.object
+            else None,
             posture=entry.posture,
-            palm=_palm(entry),
+            palm=_palm(entry, location),
         )
     except InputError as error:
         raise DescriptionError(f"{path}: {key_prefix}{error}") from error
 
 
-def _palm(entry: GraspFile) -> Array | dict[str, Array] | None:
+def _palm(entry: GraspFile, location: str) -> Array | dict[str, Array] | None:
     if entry.palm and entry.palms:
         raise InputError("palms: is given together with palm; expected one of them")
     if entry.palms:
-        return {side: frame_matrix(frame) for side, frame in entry.palms.items()}
-    return frame_matrix(entry.palm) if entry.palm else None
+        return {
+            side: frame_matrix(frame, f"{location}palms.{side}")
+            for side, frame in entry.palms.items()
+        }
+    return frame_matrix(entry.palm, f"{location}palm") if entry.palm else None
 
 
 def _contact(entry: ContactEntry) -> Contact:

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib.util import find_spec
@@ -24,6 +24,12 @@ import numpy as np
 
 from casadi_ik.errors import DescriptionError, MissingExtraError, install_command, os_errors
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks import (
+    MAX_DEGREES,
+    warn_of_angles,
+    warn_of_joint_limit,
+    warn_of_joint_offset,
+)
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
 from casadi_ik.model import sandbox
 from casadi_ik.model.couplings import Coupling, Linear, Polynomial
@@ -39,6 +45,7 @@ from casadi_ik.model.xml_tree import (
     mjcf_pose,
     mjcf_shapes,
     origin_pose,
+    parse_numbers,
     parse_xml,
     read_robot_file,
     required_attribute,
@@ -323,6 +330,7 @@ def read_urdf(element: Element, path: Path) -> RobotTree:
     joints = dict(zip(names, elements, strict=True))
     for name, joint in joints.items():
         _check_joint(joint, links, f"{path}: joint {name!r}")
+    _warn_of_units(joints, path)
     root = _root(links, joints, path)
     if not joints:
         raise DescriptionError(
@@ -365,6 +373,31 @@ def _check_joint(joint: Element, links: list[str], location: str) -> None:
     low, high = (limit or 0.0 for limit in limits)
     if low > high:
         raise DescriptionError(f"{location}: limit: lower {low:.6g} is above upper {high:.6g}")
+
+
+def _warn_of_units(joints: Mapping[str, Element], path: Path) -> None:
+    """Warn of the joints with the largest numbers if they are probably in mm or degrees."""
+
+    def origin(name: str, key: str) -> list[float]:
+        element = joints[name].find("origin")
+        return parse_numbers("0 0 0" if element is None else element.get(key, "0 0 0"))
+
+    def limit(name: str) -> float:
+        is_revolute = joints[name].get("type") == "revolute"
+        limits = _stated_limits(joints[name].find("limit"), name) if is_revolute else []
+        return max((abs(value or 0.0) for value in limits), default=0.0)
+
+    offsets = {name: math.hypot(*origin(name, "xyz")) for name in joints}
+    angles = {name: max(map(abs, origin(name, "rpy"))) for name in joints}
+    limits = {name: limit(name) for name in joints if limit(name) <= MAX_DEGREES}
+    for values, warn in (
+        (offsets, warn_of_joint_offset),
+        (angles, lambda angle, location: warn_of_angles([angle], f"{location}: origin: rpy")),
+        (limits, warn_of_joint_limit),
+    ):
+        if values:
+            name = max(values, key=values.__getitem__)
+            warn(values[name], f"{path}: joint {name!r}")
 
 
 def _root(links: list[str], joints: dict[str, Element], path: Path) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 
 import numpy as np
@@ -129,3 +130,56 @@ def test_a_mobile_base_may_go_far():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ik.Solver(body).solve_batch(far_points[None], normals[None])
+
+
+def test_angles_in_degrees(tmp_path, capsys):
+    with pytest.warns(ik.errors.InputWarning, match=r"solids\.wall\.rpy: .*90 .*degrees"):
+        ik.Scene({"wall": WALL | {"rpy": [0.0, 0.0, 90.0]}})
+    text = (
+        "robot: kuka_lwr_barrett\n"
+        "object: {name: cup, pose: {xyz: [-0.8, 0.1, 0.4], rpy: [0, 0, -45]}}\n"
+        "contacts: {thumb: {point: [-0.83, 0.15, 0.41]}}\n"
+    )
+    path = tmp_path / "grasp.yaml"
+    path.write_text(text)
+    with pytest.warns(ik.errors.InputWarning, match=r"grasp\.yaml: object\.pose\.rpy: .*45 "):
+        ik.load_grasp(path)
+    path.write_text(text.replace("-45", "-45 deg"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ik.load_grasp(path)
+        ik.Scene({"wall": WALL | {"rpy": [0.0, 0.0, 2 * np.pi]}})
+    main(["solve", str(path), "--object-pose", "-0.8", "0.1", "0.4", "0", "0", "-45"])
+    assert "--object-pose: found an angle of 45 rad" in " ".join(capsys.readouterr().err.split())
+
+
+ARM = """<robot name="arm"><link name="base"/><link name="a"/><link name="b"/>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="a"/><origin xyz="0 0 {}"/>
+<axis xyz="0 0 1"/><limit lower="-{}" upper="3" effort="1" velocity="1"/></joint>
+<joint name="elbow" type="revolute"><parent link="a"/><child link="b"/><origin xyz="0 0 0.2"
+rpy="0 0 {}"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+</robot>"""
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        (("350", "3", "0"), "joint 'shoulder': .*350 m .*mm"),
+        (("0.35", "170", "0"), "joint 'shoulder': .*170 rad.*degrees"),
+        (("0.35", "3", "90"), "joint 'elbow': origin: rpy: .*90 rad.*degrees"),
+        (("0.35", "1000", "3.14159"), ""),
+    ],
+)
+def test_a_robot_in_other_units(tmp_path, numbers, words):
+    path, robot = tmp_path / "arm.urdf", tmp_path / "robot.yaml"
+    path.write_text(ARM.format(*numbers))
+    robot.write_text(
+        "name: arm\nrobot: {file: arm.urdf, palm: {link: a}}\n"
+        "fingers: {tip: {link: b, xyz: [0, 0, 0.1], normal: [1, 0, 0]}}\n"
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ik.load_robot(robot)
+    messages = [str(item.message) for item in caught]
+    assert len(messages) == (1 if words else 0)
+    assert not words or re.search(words, messages[0])

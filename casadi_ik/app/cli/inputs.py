@@ -19,6 +19,7 @@ from casadi_ik.errors import (
     did_you_mean,
 )
 from casadi_ik.files.arrays import Array
+from casadi_ik.files.input_checks import warn_of_angles
 from casadi_ik.files.reading import Frame, frame_matrix
 from casadi_ik.files.shipped import resolve_description, resolve_robot
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
@@ -164,6 +165,7 @@ def parse_object_pose(args: Arguments) -> Array | None:
     if args.object_pose is None:
         return None
     x, y, z, roll, pitch, yaw = args.object_pose
+    warn_of_angles((roll, pitch, yaw), "--object-pose")
     return frame_matrix(Frame((x, y, z), (roll, pitch, yaw)))
 
 
