@@ -15,9 +15,8 @@ from casadi_ik.collision.clearance import DISTANCE_ROUNDING, CollisionQuery
 from casadi_ik.files.arrays import Array, Bools
 from casadi_ik.model.targets import CLEARANCE, TargetBatch
 from casadi_ik.solve.alternatives import ALTERNATIVES, AlternativeFinder
-from casadi_ik.solve.arm_search import ArmSearch, Preference
+from casadi_ik.solve.arm_search import Preference
 from casadi_ik.solve.collision_free import find_collision_free
-from casadi_ik.solve.free_rotations import FreeRotations, RotationSearch
 from casadi_ik.solve.row_selection import Deduplicator, largest_per_owner
 from casadi_ik.solve.status import Status
 from casadi_ik.solve.turns import nearest_turns, search_start
@@ -224,8 +223,12 @@ class CandidateSearch:
         if arms is not None:
             solutions, hand = self._arms(solutions, solution_candidate, surplus[free_rows])
             solution_candidate = solution_candidate[hand]
-        solutions, solution_candidate = self._with_free_rotations(
-            (q, candidate), (solutions, solution_candidate)
+        solutions, solution_candidate = self.finder.with_free_rotations(
+            self.targets,
+            (q, candidate),
+            (solutions, solution_candidate),
+            (self.starts, self.prefer, query),
+            self.max_refined,
         )
         if query is None:
             return solutions, solution_candidate, {}
@@ -235,51 +238,6 @@ class CandidateSearch:
         clearances = query.rows(candidate[failed]).check(q[failed])
         pairs = ((row, clearances.pair(i)) for i, row in enumerate(candidate[failed].tolist()))
         return solutions, solution_candidate, {row: p for row, p in pairs if p is not None}
-
-    def _with_free_rotations(
-        self, hands: tuple[Array, NDArray[np.intp]], solutions: tuple[Array, NDArray[np.intp]]
-    ) -> tuple[Array, NDArray[np.intp]]:
-        """Return solutions and those with the preferred rotations of palms, where they are free.
-
-        For a multi-arm robot the arms of all sides are searched successively.
-
-        Args:
-            hands: (m, n) configurations with all distinct hands, and indices of their candidates.
-            solutions: (p, n) collision-free solutions, and indices of their candidates.
-        """
-        robot, finder = self.finder.robot, self.finder
-        count = self.max_refined
-        if finder.arm_search is not None:
-            fingers = list(range(len(robot.fingers)))
-            search = self._rotation_search(finder.arm_search, None, finder.hand, fingers)
-            q, candidate = hands
-            rows = np.flatnonzero(search.rotations.is_free[candidate])
-            return _concatenate(solutions, search.run(q[rows], candidate[rows], count))
-        sides = zip(robot.description.sides, robot.description.side_actuators, strict=True)
-        for arms, (side, (_, hand)) in zip(finder.side_searches, sides, strict=False):
-            fingers = [robot.fingers.index(name) for name in side.fingers]
-            search = self._rotation_search(arms, side.name, list(hand), fingers)
-            q, candidate = solutions
-            order = np.argsort(-self._score(q, candidate), kind="stable")
-            solutions = _concatenate(solutions, search.run(q[order], candidate[order], count))
-        return solutions
-
-    def _rotation_search(
-        self, arms: ArmSearch, side: str | None, hand: list[int], fingers: list[int]
-    ) -> RotationSearch:
-        """Return the search over the rotations of one hand."""
-        return RotationSearch(
-            self.subproblems,
-            arms,
-            side,
-            hand,
-            fingers,
-            FreeRotations.of_targets(self.finder.robot.description, self.targets, fingers),
-            self.targets,
-            self.starts,
-            self.prefer,
-            self.query,
-        )
 
     def _arms(
         self, q: Array, candidate: NDArray[np.intp], surplus: Array
@@ -321,10 +279,3 @@ class CandidateSearch:
         if self.prefer == CLEARANCE and self.query is not None:
             surplus = self.query.rows(candidate).check(q).surplus
         return self.finder.score(q, self.starts[candidate], self.prefer, self.columns, surplus)
-
-
-def _concatenate(
-    a: tuple[Array, NDArray[np.intp]], b: tuple[Array, NDArray[np.intp]]
-) -> tuple[Array, NDArray[np.intp]]:
-    """Return configurations and indices of their candidates of both."""
-    return np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])

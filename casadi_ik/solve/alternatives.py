@@ -7,6 +7,7 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from casadi_ik.collision.clearance import CollisionQuery
 from casadi_ik.compile import FunctionKernel
@@ -21,6 +22,7 @@ from casadi_ik.model.grasp import Tolerance
 from casadi_ik.model.targets import CLEARANCE, TargetBatch
 from casadi_ik.solve.arm_branches import ArmBranches
 from casadi_ik.solve.arm_search import ArmSearch, Preference
+from casadi_ik.solve.free_rotations import FreeRotations, RotationSearch
 from casadi_ik.solve.hand_first.multi_arm import MultiArmStep
 from casadi_ik.solve.method import HandSearch
 from casadi_ik.solve.row_selection import distinct_rows
@@ -54,6 +56,8 @@ class AlternativeParameters:
         tight_tolerance: Tolerance [m, rad] of the first fit of hand postures, small enough to
             recognise duplicates.
         trunks: Number of trunk postures of a multi-arm robot that are tried with each hand.
+        rotated_hands: Maximum number of rotations of a free palm that are refined, each with all
+            arms.
         random_arms: Number of random starts of an arm without a closed form.
         collision_penalty: Reduction of the score of colliding solutions; larger than any score.
     """
@@ -61,6 +65,7 @@ class AlternativeParameters:
     min_difference: float = 0.05
     tight_tolerance: float = 1e-7
     trunks: int = 64
+    rotated_hands: int = 6
     random_arms: int = 64
     collision_penalty: float = 1e6
 
@@ -174,8 +179,10 @@ class AlternativeFinder:
         targets = with_search_starts(robot, targets)
         (q0,) = targets.starts(robot)
         candidates: list[_Candidate] = []
-        for number, q in enumerate(self._postures(targets, limits)):
+        postures = self._postures(targets, limits)
+        for number, q in enumerate(postures):
             candidates += self._arm_candidates(targets, q, number, limits, prefer, query)
+        candidates += self._rotated_candidates(targets, postures, limits, prefer, query)
         if not candidates:
             return ()
         q = np.stack([candidate.q for candidate in candidates])
@@ -195,6 +202,74 @@ class AlternativeFinder:
         q = nearest_turns(robot, q, start, bounds, prefer == "q0")
         distinct_candidates = [replace(candidates[order[i]], q=q[order[i]]) for i in rows]
         return tuple(self._describe(targets, candidate, start) for candidate in distinct_candidates)
+
+    def _rotated_candidates(
+        self,
+        targets: TargetBatch,
+        postures: list[Array],
+        limits: MotorBounds,
+        prefer: str,
+        query: CollisionQuery | None,
+    ) -> list[_Candidate]:
+        """Return solutions with the preferred rotations of the palm, if it is free to rotate."""
+        hands = np.reshape(postures, (len(postures), len(self.robot.actuators)))
+        solutions = hands if query is None else hands[query.free(hands)]
+        owners = [np.zeros(len(q), dtype=np.intp) for q in (hands, solutions)]
+        starts, count = targets.starts(self.robot.description), ALTERNATIVES.rotated_hands
+        q, _ = self.with_free_rotations(
+            targets, (hands, owners[0]), (solutions, owners[1]), (starts, prefer, query), count
+        )
+        rotated, number = q[len(solutions) :], len(postures)
+        if self.robot.description.sides:
+            return [_Candidate(configuration, number) for configuration in rotated]
+        score = self._collision_aware_score(rotated, starts, prefer, query)
+        candidates = []
+        for i, row in enumerate(np.argsort(-score, kind="stable")[:count]):
+            candidates += self._arm_candidates(
+                targets, rotated[row], number + i, limits, prefer, query
+            )
+        return candidates
+
+    def with_free_rotations(
+        self,
+        targets: TargetBatch,
+        hands: tuple[Array, NDArray[np.intp]],
+        solutions: tuple[Array, NDArray[np.intp]],
+        ranking: tuple[Array, Preference, CollisionQuery | None],
+        max_refined: int,
+    ) -> tuple[Array, NDArray[np.intp]]:
+        """Return solutions, followed by those with the preferred rotations of free palms.
+
+        For a multi-arm robot the arms of all sides are searched successively.
+
+        Args:
+            targets: k targets.
+            hands: (m, n) configurations with all distinct hands, and indices of their targets.
+            solutions: (p, n) collision-free solutions, and indices of their targets.
+            ranking: Initial configurations (k, n), preference, and the pairs that must not collide.
+            max_refined: Maximum number of rotations of all targets that are refined.
+        """
+        robot = self.robot.description
+        if self.arm_search is not None:
+            fingers = list(range(len(robot.fingers)))
+            rotations = FreeRotations.of_targets(robot, targets, fingers)
+            q, owner = hands
+            rows = np.flatnonzero(rotations.is_free[owner])
+            search = RotationSearch(
+                self.subproblems, self.arm_search, None, self.hand, rotations, targets, *ranking
+            )
+            return _concatenate(solutions, search.run(q[rows], owner[rows], max_refined))
+        for number, arms in enumerate(self.side_searches):
+            side, (_, hand) = robot.sides[number], robot.side_actuators[number]
+            fingers = [robot.finger_names.index(name) for name in side.fingers]
+            rotations = FreeRotations.of_targets(robot, targets, fingers)
+            q, owner = solutions
+            order = np.argsort(-self.score(q, ranking[0][owner], ranking[1]), kind="stable")
+            search = RotationSearch(
+                self.subproblems, arms, side.name, list(hand), rotations, targets, *ranking
+            )
+            solutions = _concatenate(solutions, search.run(q[order], owner[order], max_refined))
+        return solutions
 
     def best_arm(self, targets: TargetBatch, q: Array, prefer: str) -> Array:
         """Return the solution (n,) with the best arm for the hand of a solution.
@@ -435,6 +510,13 @@ class AlternativeFinder:
             manipulability=float(self._manipulability_values(q)[0]),
             distance=float(-self.score(q, q0, "q0")[0]),
         )
+
+
+def _concatenate(
+    a: tuple[Array, NDArray[np.intp]], b: tuple[Array, NDArray[np.intp]]
+) -> tuple[Array, NDArray[np.intp]]:
+    """Return configurations, and indices of their targets, of both."""
+    return np.concatenate([a[0], b[0]]), np.concatenate([a[1], b[1]])
 
 
 def side_links(robot: RobotDescription) -> list[tuple[frozenset[str], frozenset[str]]]:

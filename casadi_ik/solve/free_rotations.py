@@ -63,12 +63,14 @@ class FreeRotations:
     Attributes:
         centre: (k, 3) point on the axis [m], base frame.
         axis: (k, 3) unit vector, base frame.
+        fingers: Indices of the fingers of the hand.
         is_free: (k,) True if the contacts allow all rotations about the axis.
         base: (3, 3) rotation of the robot's base, relative to which a reference is chosen.
     """
 
     centre: Array
     axis: Array
+    fingers: Sequence[int]
     is_free: Bools
     base: Array
 
@@ -109,7 +111,7 @@ class FreeRotations:
         for name in (SLIDING_ARRAYS | {"tangents"}) & targets.extra_vectors.keys():
             is_free &= np.isnan(targets.extra_vectors[name][:, fingers, 0]).all(axis=1)
         is_free &= targets.palms is None
-        return cls(centre, axis, is_free, base_rotation(robot))
+        return cls(centre, axis, fingers, is_free, base_rotation(robot))
 
     def rotate(self, palms: Array, owner: NDArray[np.intp], angles: Array) -> Array:
         """Return palm poses (m, 4, 4) rotated by angles (m,) [rad] about the axes of targets (m,).
@@ -167,7 +169,6 @@ class RotationSearch:
         arms: Arm search of the hand.
         side: Name of the side of a multi-arm robot; None for a robot with one arm.
         hand: Positions in q of the hand motors.
-        fingers: Indices of the fingers of the hand.
         rotations: Free rotations of the targets.
         targets: The targets.
         starts: (k, n) initial configurations [rad or m].
@@ -179,7 +180,6 @@ class RotationSearch:
     arms: ArmSearch
     side: str | None
     hand: Sequence[int]
-    fingers: Sequence[int]
     rotations: FreeRotations
     targets: TargetBatch
     starts: Array
@@ -231,7 +231,7 @@ class RotationSearch:
 
     def _misses(self, q: Array, owner: NDArray[np.intp]) -> Array:
         """Return the largest error of the hand's contacts, rounded to percent of tolerances."""
-        targets, fingers = self.targets.rows(owner), list(self.fingers)
+        targets, fingers = self.targets.rows(owner), list(self.rotations.fingers)
         tolerances = residual_tolerances(targets)
         misses = residual_norms(self.subproblems.robot, targets, q) / np.maximum(tolerances, 1e-12)
         return misses[:, fingers].max(axis=(1, 2), initial=0.0).round(2)

@@ -271,3 +271,5 @@ def test_free_rotation_of_the_palm_is_searched(name, prefer):
         known_score = scored(robot, q[None], prefer, start)[0]
         assert min(scores) >= known_score - 1e-3
         assert np.ptp(scores) < 1e-3
+        best = solver.solve_all(grasp, q0=start, prefer=prefer)[0]
+        assert scored(robot, best.q[None], prefer, start)[0] >= known_score - 1e-3
