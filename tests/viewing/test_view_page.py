@@ -7,14 +7,14 @@ import socket
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
 from casadi_ik import errors
-from casadi_ik.app import viewer as viewing
-from casadi_ik.app.viewer.viser_scene import pose_of
 
 
 def shifted(pose: np.ndarray, *by: float) -> np.ndarray:
@@ -23,7 +23,7 @@ def shifted(pose: np.ndarray, *by: float) -> np.ndarray:
     return moved_pose
 
 
-def test_page_starts_solved_and_local(cup: viewing.Viewer) -> None:
+def test_page_starts_solved_and_local(cup: Any) -> None:
     page = cup.page
     assert page.result.success
     assert page.result.clearance is not None
@@ -33,11 +33,11 @@ def test_page_starts_solved_and_local(cup: viewing.Viewer) -> None:
     port = int(cup.url.rpartition(":")[2])
     with socket.create_connection(("127.0.0.1", port), 5) as connection:
         assert connection.getpeername()[0] == "127.0.0.1"
-    with pytest.raises(errors.InputError, match=f"port: {port}"):
-        viewing.view_grasp(page.robot, port=port)
+    with pytest.raises(errors.InputError, match=str(port)):
+        page.robot.view(port=port)
 
 
-def test_a_dragged_contact_and_normal_are_reached(cup: viewing.Viewer) -> None:
+def test_a_dragged_contact_and_normal_are_reached(cup: Any) -> None:
     page, robot = cup.page, cup.page.robot
     q_before = page.result.q
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.004, 0.008, 0.004))
@@ -53,7 +53,7 @@ def test_a_dragged_contact_and_normal_are_reached(cup: viewing.Viewer) -> None:
     assert np.abs(page.result.q - q_before).max() < 0.5
 
 
-def test_links_match_the_kinematics(cup: viewing.Viewer, rng: np.random.Generator) -> None:
+def test_links_match_the_kinematics(cup: Any, rng: np.random.Generator) -> None:
     """Link poses that a browser composes equal the robot's kinematics."""
     page, robot = cup.page, cup.page.robot
     page.drag_motors(robot.random(rng, 1)[0])
@@ -62,7 +62,10 @@ def test_links_match_the_kinematics(cup: viewing.Viewer, rng: np.random.Generato
     poses: dict[str, np.ndarray] = {"/robot": np.eye(4)}
     for name, mesh in frames.items():
         on = poses[name.rpartition("/")[0]]
-        poses[name] = on @ pose_of(mesh.position, mesh.wxyz)
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_quat(mesh.wxyz, scalar_first=True).as_matrix()
+        pose[:3, 3] = mesh.position
+        poses[name] = on @ pose
     links = robot.links(page.result.q)
     assert len(frames) == len(robot.description.links)
     for name, place in poses.items():
@@ -70,7 +73,7 @@ def test_links_match_the_kinematics(cup: viewing.Viewer, rng: np.random.Generato
             assert np.abs(place - links[name.rpartition("/")[2]]).max() < 1e-8
 
 
-def test_unreachable_contact_shows_reason_and_nearest(cup: viewing.Viewer) -> None:
+def test_unreachable_contact_shows_reason_and_nearest(cup: Any) -> None:
     page, robot = cup.page, cup.page.robot
     page.drag("object", shifted(page.request.object_pose, -0.6, 0.0, 0.0))
     assert page.work.settle(300)
@@ -86,7 +89,7 @@ def test_unreachable_contact_shows_reason_and_nearest(cup: viewing.Viewer) -> No
 
 
 def test_drag_beyond_reach_does_not_wait_for_the_diagnosis(
-    cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch
+    cup: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page, results_drawn, draw = cup.page, [], cup.page.draw
     monkeypatch.setattr(page, "draw", lambda result: (results_drawn.append(result), draw(result)))
@@ -111,7 +114,7 @@ def test_drag_beyond_reach_does_not_wait_for_the_diagnosis(
     assert any("thumb" in line for line in at_rest.reasons)
 
 
-def test_answers_avoid_a_dragged_table(cup: viewing.Viewer) -> None:
+def test_answers_avoid_a_dragged_table(cup: Any) -> None:
     page = cup.page
     pose = page.request.scene.items["table"].pose
     page.drag("table", shifted(pose, -1.3, 0.0, 0.36))
@@ -132,7 +135,7 @@ def test_answers_avoid_a_dragged_table(cup: viewing.Viewer) -> None:
     assert page.result.success
 
 
-def test_all_solutions_can_be_browsed(cup: viewing.Viewer) -> None:
+def test_all_solutions_can_be_browsed(cup: Any) -> None:
     page = cup.page
     # Solutions are listed after the drag is answered.
     page.drag("thumb", shifted(page.request.contacts["thumb"].control, 0.0, 0.0, 0.001))
@@ -149,7 +152,7 @@ def test_all_solutions_can_be_browsed(cup: viewing.Viewer) -> None:
     assert f"{len(q_shown)} of {len(q_shown)}" in page._panel._solution.content
 
 
-def test_solutions_and_methods_are_shown_together(cup: viewing.Viewer) -> None:
+def test_solutions_and_methods_are_shown_together(cup: Any) -> None:
     page, scene = cup.page, cup._server.scene
     page.show_ghosts(True)
     page.compare("enhanced-dls")
@@ -165,7 +168,7 @@ def test_solutions_and_methods_are_shown_together(cup: viewing.Viewer) -> None:
     assert not any(name.startswith(("/ghosts/", "/beside")) for name in left)
 
 
-def test_undo_and_redo(cup: viewing.Viewer) -> None:
+def test_undo_and_redo(cup: Any) -> None:
     page = cup.page
     poses = [page.request.object_pose[:3, 3]]
     for step in (0.01, 0.02):
@@ -179,7 +182,7 @@ def test_undo_and_redo(cup: viewing.Viewer) -> None:
         assert page.result.success
 
 
-def test_dragged_object_stays_grasped(cup: viewing.Viewer) -> None:
+def test_dragged_object_stays_grasped(cup: Any) -> None:
     page = cup.page
     start, point_before = page.request.object_pose, page.request.grasp.contacts["thumb"].point
     for angle in np.linspace(0.0, 2 * np.pi, 12):
@@ -190,7 +193,7 @@ def test_dragged_object_stays_grasped(cup: viewing.Viewer) -> None:
         assert np.allclose(page.request.grasp.contacts["thumb"].point - point_before, shift)
 
 
-def test_written_page_needs_no_server(cup: viewing.Viewer, tmp_path: Path) -> None:
+def test_written_page_needs_no_server(cup: Any, tmp_path: Path) -> None:
     text = cup.to_html(tmp_path / "scene.html")
     assert (tmp_path / "scene.html").read_text(encoding="utf-8") == text
     assert "<title>cup</title>" in text
@@ -198,8 +201,8 @@ def test_written_page_needs_no_server(cup: viewing.Viewer, tmp_path: Path) -> No
     assert not re.search(r'(src|href)="https?://', text)
 
 
-def test_robot_grasp_and_scene_can_be_opened(robot: ik.ArmHand) -> None:
-    viewer = viewing.view_grasp(robot, ik.load_grasp("cup"))
+def test_robot_grasp_and_scene_can_be_opened(view: Any) -> None:
+    viewer = view("cup")
     assert "collision not checked" in viewer.page.result.sentence
     opened = (
         ({"scene": "table"}, "cup", "table"),
@@ -222,10 +225,9 @@ def test_robot_grasp_and_scene_can_be_opened(robot: ik.ArmHand) -> None:
     viewer.page.open(robot="no such robot")
     assert viewer.page.work.settle(300)
     assert viewer.page.robot.name == "ar10"
-    viewer.stop()
 
 
-def test_moved_scene_is_saved(cup: viewing.Viewer, tmp_path: Path) -> None:
+def test_moved_scene_is_saved(cup: Any, tmp_path: Path) -> None:
     page = cup.page
     page.drag("table", shifted(page.request.scene.items["table"].pose, 0.1, 0.0, -0.05))
     assert page.work.settle(300)
@@ -234,7 +236,7 @@ def test_moved_scene_is_saved(cup: viewing.Viewer, tmp_path: Path) -> None:
     assert np.allclose(saved_scene.items["table"].pose, page.request.scene.items["table"].pose)
 
 
-def test_manually_moved_motors_are_judged_not_solved(cup: viewing.Viewer) -> None:
+def test_manually_moved_motors_are_judged_not_solved(cup: Any) -> None:
     page = cup.page
     q = page.result.q.copy()
     q[0] += 0.2
@@ -245,11 +247,11 @@ def test_manually_moved_motors_are_judged_not_solved(cup: viewing.Viewer) -> Non
     assert all(verdict.position_error > 5e-3 for verdict in page.result.verdicts.values())
 
 
-def test_settings_reach_the_solver(cup: viewing.Viewer) -> None:
+def test_settings_reach_the_solver(cup: Any) -> None:
     page = cup.page
     tight = ik.Tolerance(1e-6, 1e-6)
-    tightly = viewing.Settings(tolerance=tight, prefer="limits")
-    page.change("settings", lambda a: replace(a, settings=tightly))
+    tightly = replace(page.request.settings, tolerance=tight, prefer="limits")
+    page.change("settings", lambda request: replace(request, settings=tightly))
     assert page.work.settle(300)
     assert page.result.success
     assert {verdict.tolerance for verdict in page.result.verdicts.values()} == {tight}

@@ -21,8 +21,6 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 from websockets.typing import Origin, Subprotocol
 
-from casadi_ik.app import viewer as viewing
-
 VERSION = f"viser-v{viser.__version__}"
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -72,7 +70,7 @@ def fetch_page(url: str, **headers: str) -> tuple[int, bytes]:
         return error.code, error.read()
 
 
-def dragged(viewer: viewing.Viewer) -> dict[str, Any]:
+def dragged(viewer: Any) -> dict[str, Any]:
     """Return the message of a browser that moves the first contact."""
     control = viewer.page._handles._controls[viewer.page.robot.fingers[0]].handle
     position = control.position + np.array([0.0, 0.002, 0.0])
@@ -99,7 +97,7 @@ def pressed(handle: Any) -> dict[str, Any]:
         ("127.0.0.1.evil.example:8080", None),
     ],
 )
-def test_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str | None) -> None:
+def test_foreign_page_is_refused(cup: Any, host: str, origin: str | None) -> None:
     with pytest.raises(InvalidStatus) as caught:
         opened(cup.url, host, origin)
     assert caught.value.response.status_code == 403
@@ -108,7 +106,7 @@ def test_foreign_page_is_refused(cup: viewing.Viewer, host: str, origin: str | N
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
-def test_own_page_is_answered(cup: viewing.Viewer, name: str) -> None:
+def test_own_page_is_answered(cup: Any, name: str) -> None:
     """The page answers through a tunnel with another port, too."""
     address = urlsplit(cup.url)
     assert b"<html" in fetch_page(cup.url, Host=f"{name}:9999")[1].lower()
@@ -136,8 +134,11 @@ def test_writable_page_needs_a_token(pads, description: Path) -> None:
     assert description.read_text() != text_before
 
 
-def test_disabled_button_cannot_be_pressed(description: Path) -> None:
-    text_before, viewer = description.read_text(), viewing.view_pads(description, host="0.0.0.0")
+def test_disabled_button_cannot_be_pressed(description: Path, view: Any) -> None:
+    text_before, viewer = (
+        description.read_text(),
+        view("--pads", str(description), "--host", "0.0.0.0"),
+    )
     assert viewer.page._save_button.disabled
     with opened(viewer.url) as page:
         assert greeted(page)
@@ -151,10 +152,9 @@ def test_disabled_button_cannot_be_pressed(description: Path) -> None:
         assert greeted(page)
     with pytest.raises(InvalidStatus):
         opened(viewer.url, "evil.example")
-    viewer.stop()
 
 
-def test_sessions_share_nothing(cup: viewing.Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sessions_share_nothing(cup: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     servers: list[Any] = []
 
     def tunnel(*words: Any) -> None:
@@ -172,8 +172,10 @@ def test_sessions_share_nothing(cup: viewing.Viewer, monkeypatch: pytest.MonkeyP
 
 def test_malformed_messages_are_harmless(tmp_path: Path) -> None:
     code = (
-        "from casadi_ik.app import viewer as viewing; import casadi_ik as ik, sys\n"
-        "viewer = viewing.view_grasp(ik.load_robot('kuka_lwr_barrett'), ik.load_grasp('cup'))\n"
+        "import casadi_ik as ik, sys\n"
+        "grasp = ik.load_grasp('cup')\n"
+        "solution = ik.Solver(ik.load_robot('kuka_lwr_barrett')).solve(grasp)\n"
+        "viewer = solution.view(grasp=grasp)\n"
         "panel, controls = viewer.page._panel, viewer.page._handles._controls\n"
         "print(viewer.url, panel._drag._impl.uuid, controls['thumb'].handle.name,\n"
         "      panel._motors[0]._impl.uuid, flush=True)\n"
