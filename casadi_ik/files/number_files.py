@@ -60,6 +60,15 @@ def check_unpacked_size(location: str, size: int, max_size: int) -> None:
         )
 
 
+def npz_names(path: Path) -> list[str] | None:
+    """Return the names of the arrays of an npz file, or None if the file cannot be read."""
+    try:
+        with zipfile.ZipFile(path) as members:
+            return [name.removesuffix(".npy") for name in members.namelist()]
+    except (OSError, *READ_ERRORS):
+        return None
+
+
 def read_npz(path: Path, max_size: int) -> dict[str, Array]:
     """Read all arrays of a file without executing anything in it.
 

@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from processes import POSIX
 
 import casadi_ik as ik
-from casadi_ik import model as grasps
-from casadi_ik.app.cli.outputs import OutputError, check_outputs
-from casadi_ik.solve.target_files import TargetFile
 
+ROBOT = "kuka_lwr_barrett"
 CONTACT = "contacts: {thumb: {point: [0, 0, 0]}}\n"
 
 HOSTILE = {
@@ -44,7 +42,7 @@ def test_hostile_yaml(tmp_path: Path, case: str) -> None:
     text, says = HOSTILE[case]
     path = tmp_path / "grasp.yaml"
     path.write_text(text)
-    for load in (ik.load_grasp, ik.load_robot, grasps.load_object):
+    for load in (ik.load_grasp, ik.load_robot, ik.load_scene):
         with pytest.raises(ik.errors.DescriptionError) as caught:
             load(path)
         assert says in str(caught.value)
@@ -114,14 +112,6 @@ def test_terminal_commands_in_names_are_escaped() -> None:
     assert text.endswith("xxx")
 
 
-def test_output_equal_to_the_input_is_refused(tmp_path: Path) -> None:
-    source, link = tmp_path / "in.yaml", tmp_path / "link.mcap"
-    source.write_text("")
-    link.hardlink_to(source)
-    with pytest.raises(OutputError, match="--log: file is the same as that of the input"):
-        check_outputs({"--log": link}, inputs=[source])
-
-
 def npz(path: Path, shape: tuple[int, ...], data: bytes) -> Path:
     """Write an npz file whose arrays claim a shape."""
     import io
@@ -149,13 +139,14 @@ def npz(path: Path, shape: tuple[int, ...], data: bytes) -> Path:
 def test_hostile_npz(tmp_path: Path, shape: tuple[int, ...], size: int, says: str) -> None:
     path = npz(tmp_path / "targets.npz", shape, bytes(size))
     with pytest.raises(ik.errors.InputError, match=says):
-        TargetFile(path, 3).check(64)
+        ik.load_candidates(path, ROBOT)
 
 
 @POSIX
 def test_endless_file_is_refused() -> None:
-    with pytest.raises(ik.errors.InputError, match="not a regular file"):
-        TargetFile(Path("/dev/zero"), 3).check(64)
+    for load in (ik.load_grasp, ik.load_scene, partial(ik.load_candidates, robot=ROBOT)):
+        with pytest.raises(ik.errors.DescriptionError, match="/dev/zero"):
+            load("/dev/zero")
 
 
 WORDS = st.sampled_from(
@@ -184,15 +175,17 @@ def refused(load: Callable[[], object]) -> None:
 def test_any_text_is_read_or_refused(tmp_path_factory, text: bytes | str) -> None:
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
-    for load in (ik.load_grasp, ik.load_robot, grasps.load_object):
+    for load in (ik.load_grasp, ik.load_robot, ik.load_scene):
         refused(partial(load, path))
 
 
 @settings(max_examples=150, deadline=None, derandomize=True, database=None)
 @given(place=st.integers(0, 2000), byte=st.integers(0, 255), cut=st.integers(0, 2000))
-def test_any_npz_is_read_or_refused(tmp_path_factory, place: int, byte: int, cut: int) -> None:
+def test_any_npz_is_read_or_refused(
+    tmp_path_factory, robot, place: int, byte: int, cut: int
+) -> None:
     path = npz(tmp_path_factory.getbasetemp() / "any.npz", (4, 3, 3), bytes(range(144)) * 2)
     data = bytearray(path.read_bytes())
     data[place % len(data)] = byte
     path.write_bytes(data[: max(1, len(data) - cut % 40)])
-    refused(partial(TargetFile(path, 3).check, 2))
+    refused(partial(ik.load_candidates, path, robot))

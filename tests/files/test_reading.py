@@ -1,4 +1,4 @@
-"""Description files: units, keys, and errors of malformed files."""
+"""Description files, read as scenes: units, keys, and errors of malformed files."""
 
 from __future__ import annotations
 
@@ -6,148 +6,116 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 import pytest
+from processes import MODELS
+from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
-from casadi_ik.files.reading import (
-    UNITS,
-    Frame,
-    Struct,
-    Vector,
-    frame_matrix,
-    read,
-)
-from casadi_ik.files.shipped import models_folder, resolve_description
+
+SOLID = "solids: {{a: {{kind: sphere, radius: 1, {}}}}}"
 
 
-class Entry(Struct, frozen=True):
-    """File with values of every type."""
-
-    number: float = 0.0
-    text: str = ""
-    named: dict[str, float] = {}  # noqa: RUF012
-    deep: dict[str, dict[str, Vector]] = {}  # noqa: RUF012
-    rows: list[Vector] = []  # noqa: RUF012
-
-
-def entry(tmp_path: Path, text: str) -> Entry:
+def pose(tmp_path: Path, text: str) -> np.ndarray:
     path = tmp_path / "file.yaml"
-    path.write_text(text)
-    return read(path, Entry)[0]
+    path.write_text(SOLID.format(text))
+    return ik.load_scene(path).items["a"].pose
 
 
 @pytest.mark.parametrize(
     ("written", "value"),
-    [
-        ("1.5", 1.5),
-        ("180 deg", np.pi),
-        ("-90deg", -np.pi / 2),
-        ("1e2 mm", 0.1),
-        ("+.5 cm", 0.005),
-        ("360 deg/s", 2 * np.pi),
-        ("20 mm/s", 0.02),
-        ("2 rad", 2.0),
-        ("3 m", 3.0),
-        ("4.", 4.0),
-        ("55 kg", 55.0),
-        ("2 rad/s", 2.0),
-        ("2 m/s", 2.0),
-    ],
+    [("1.5", 1.5), ("1e2 mm", 0.1), ("+.5 cm", 0.005), ("3 m", 3.0), ("4.", 4.0), ("-20mm", -0.02)],
 )
-def test_quantity(tmp_path, written, value):
-    assert entry(tmp_path, f"number: {written}").number == pytest.approx(value, rel=1e-15)
+def test_length(tmp_path, written, value):
+    assert pose(tmp_path, f"xyz: [0, {written}, 0]")[1, 3] == pytest.approx(value, rel=1e-15)
 
 
-def test_other_text_is_not_a_quantity(tmp_path):
-    assert entry(tmp_path, "text: 2 rings and a nut").text == "2 rings and a nut"
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [("60 deg", np.pi / 3), ("-90deg", -np.pi / 2), ("2 rad", 2.0), ("0.5", 0.5)],
+)
+def test_frame_is_that_of_urdf(tmp_path, rng, written, value):
+    roll, pitch = rng.uniform(-1.5, 1.5, 2).tolist()
+    expected = Rotation.from_euler("xyz", [roll, pitch, value]).as_matrix()
+    actual = pose(tmp_path, f"rpy: [{roll}, {pitch}, {written}]")
+    np.testing.assert_allclose(actual[:3, :3], expected, atol=1e-15)
 
 
 BAD = {
-    "unknown key": ("numbr: 1", "(top level)", "numbr"),
-    "unknown unit": ("number: 3 furlong", "number", "unknown unit 'furlong'; known: rad, deg"),
-    "two units": ("number: 3 mm mm", "number", "'3 mm mm'"),
-    "no number": ("number: many", "number", "'many', expected `float`, got `str`"),
-    "wrong type": ("number: [1]", "number", "expected `float`, got `array`"),
-    "named value": ("named: {a: 1, b: x, c: 1}", "named.b", "'x'"),
-    "deep value": ("deep: {a: {x: [1, 2, 3]}, b: {y: [1, 2]}}", "deep.b.y", "length 3"),
-    "row": ("rows: [[1, 2, 3], [1, 2, x]]", "rows[1][2]", "'x'"),
-    "NaN": ("number: .nan", "number", "finite"),
-    "infinity": ("rows: [[1, 2, 3], [1, -.inf, 3]]", "rows[1][1]", "finite"),
-    "named NaN": ("deep: {a: {x: [1, .nan, 3]}}", "deep.a.x[1]", "finite"),
-    "key that is a number": ("named: {1: 2}", "named", "keys"),
-    "list at the top": ("[1]", "(top level)", "expected `object`, got `array`"),
-    "empty file": ("", "(top level)", "got `null`"),
+    "unknown key": ("solid: {}", "(top level)", "solid"),
+    "unknown key of an entry": (SOLID.format("radus: 2"), "solids.a", "radus"),
+    "unknown unit": (SOLID.format("xyz: [3 furlong, 0, 0]"), "solids.a.xyz[0]", "furlong"),
+    "unit of another dimension": (SOLID.format("xyz: [1 kg, 0, 0]"), "solids.a.xyz[0]", "1 kg"),
+    "two units": (SOLID.format("xyz: [3 mm mm, 0, 0]"), "solids.a.xyz[0]", "3 mm mm"),
+    "no number": ("margin: many", "margin", "many"),
+    "wrong type": ("margin: [1]", "margin", "array"),
+    "length": (SOLID.format("xyz: [1, 2]"), "solids.a.xyz", "3"),
+    "row": ("solids: {b: {kind: convex, points: [[1, 2, x]]}}", "solids.b.points[0][2]", "x"),
+    "NaN": ("margin: .nan", "margin", "nan"),
+    "infinity": (SOLID.format("xyz: [0, 0, -.inf]"), "solids.a.xyz[2]", "-inf"),
+    "key that is a number": ("solids: {1: {}}", "solids", "int"),
+    "list at the top": ("[1]", "(top level)", "array"),
+    "empty file": ("", "(top level)", "null"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_error_names_file_and_key(tmp_path, case):
-    text, key, says = BAD[case]
+    text, key, value = BAD[case]
+    path = tmp_path / "file.yaml"
+    path.write_text(text)
     with pytest.raises(ik.errors.DescriptionError) as caught:
-        entry(tmp_path, text)
+        ik.load_scene(path)
     message = str(caught.value)
-    assert message.startswith(f"{tmp_path / 'file.yaml'}: {key}: ")
-    assert says in message
+    assert message.startswith(f"{path}: {key}: ")
+    assert value in message
     assert "\n" not in message
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "place"),
     [
-        ("number: 1\nnumber: 2", ":2:1: not valid YAML: key 'number' appears twice"),
-        ("named: {a: 1, a: 2}", ":1:15: not valid YAML: key 'a' appears twice"),
-        ("named: {[1]: 2}", ":1:9: not valid YAML: found unhashable key"),
+        ("margin: 1\nmargin: 2", ":2:1: .*'margin'"),
+        ("solids: {a: {kind: sphere, radius: 1}, a: {}}", ":1:40: .*'a'"),
+        ("solids: {[1]: 2}", ":1:10: "),
         # libyaml reports the end of the text at the start of the next line.
-        ("rows: [1, 2", ":(1:12|2:1): not valid YAML: .*expected ',' or '\\]'"),
-        ("text: 2020-99-99", ": not valid YAML: month must be in 1..12"),
-        ("rows: &rows [*rows]", ": nested too deeply"),
-        ("number: !!python/object:os.system 1", ":1:9: not valid YAML: could not determine"),
-        ("a: *b", ":1:4: not valid YAML: found undefined alias"),
+        ("solids: {a: [1, 2", ":(1:18|2:1): "),
+        ("grasped: 2020-99-99", ": "),
+        ("solids: &s [*s]", ": "),
+        ("margin: !!python/object:os.system 1", ":1:9: .*os.system"),
+        ("a: *b", ":1:4: .*alias"),
     ],
 )
-def test_not_yaml(tmp_path, text, says):
+def test_not_yaml(tmp_path, text, place):
+    path = tmp_path / "file.yaml"
+    path.write_text(text)
     with pytest.raises(ik.errors.DescriptionError) as caught:
-        entry(tmp_path, text)
+        ik.load_scene(path)
     message = str(caught.value)
-    assert re.match(re.escape(str(tmp_path / "file.yaml")) + says, message), message
+    assert re.match(re.escape(str(path)) + place, message), message
     assert "\n" not in message
 
 
 def test_unreadable_files(tmp_path):
-    with pytest.raises(ik.errors.DescriptionError, match="cannot be read"):
-        read(tmp_path, Entry)
-    (tmp_path / "latin.yaml").write_bytes("text: gr\xfc\xdfe".encode("latin-1"))
-    with pytest.raises(
-        ik.errors.DescriptionError, match=r"latin\.yaml: cannot be read: not UTF-8 text"
-    ):
-        read(tmp_path / "latin.yaml", Entry)
-
-
-def test_every_unit_is_understood(tmp_path):
-    for unit, factor in UNITS.items():
-        assert entry(tmp_path, f"number: 2 {unit}").number == 2 * factor
-
-
-def test_frame_is_that_of_urdf(rng):
-    for _ in range(20):
-        rpy = rng.uniform(-np.pi, np.pi, 3)
-        xyz = rng.normal(size=3)
-        pose = frame_matrix(Frame(tuple(xyz), tuple(rpy)))
-        expected = pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz).homogeneous
-        np.testing.assert_allclose(pose, expected, atol=1e-15)
+    (tmp_path / "latin.yaml").write_bytes("grasped: gr\xfc\xdfe".encode("latin-1"))
+    for path in (tmp_path, tmp_path / "latin.yaml", tmp_path / "nowhere.yaml"):
+        with pytest.raises(ik.errors.DescriptionError) as caught:
+            ik.load_scene(path)
+        assert str(caught.value).startswith(f"{path}: ")
 
 
 def test_shipped_names_and_paths(tmp_path):
-    assert "kuka_lwr_barrett" in ik.shipped_names("arm_hands")
-    assert resolve_description("kuka_lwr4", "arms") == models_folder() / "arms" / "kuka_lwr4.yaml"
-    (tmp_path / "part.yaml").write_text("")
-    assert (
-        resolve_description("part.yaml", "arms", relative_to=tmp_path / "robot.yaml")
-        == tmp_path / "part.yaml"
-    )
-    assert resolve_description(tmp_path / "part.yaml", "arms") == tmp_path / "part.yaml"
-    with pytest.raises(ik.errors.UnknownNameError, match=r"'kuka'; shipped: "):
-        resolve_description("kuka", "arm_hands")
-    with pytest.raises(ik.errors.DescriptionError, match=r"nowhere\.yaml:"):
-        resolve_description(str(tmp_path / "nowhere.yaml"), "arms")
+    """A part is a shipped name, or a file beside the description; names are not guessed."""
+    robot = "name: mine\narm: {arm}\nhand: barrett_bh8_280\nfingers: [thumb]\n"
+    path, part = tmp_path / "robot.yaml", MODELS / "arms" / "kuka_lwr4.yaml"
+    (tmp_path / "part.yaml").write_text(part.read_text(encoding="utf-8"), encoding="utf-8")
+    expected = None
+    for arm in ("kuka_lwr4", str(part), "part.yaml"):
+        path.write_text(robot.format(arm=arm))
+        urdf = ik.load_robot(path).urdf()
+        assert urdf == (expected or urdf)
+        expected = urdf
+    with pytest.raises(ik.errors.UnknownNameError, match="'kuka'"):
+        ik.load_robot("kuka")
+    path.write_text(robot.format(arm="nowhere.yaml"))
+    with pytest.raises(ik.errors.DescriptionError, match=r"nowhere\.yaml"):
+        ik.load_robot(path)

@@ -20,7 +20,7 @@ from casadi_ik.errors import DescriptionError, UnsupportedError, optional_import
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.input_checks import rotations_from_quaternions
 from casadi_ik.files.limits import LIMITS
-from casadi_ik.files.number_files import READ_ERRORS, check_unpacked_size, read_npz
+from casadi_ik.files.number_files import READ_ERRORS, check_unpacked_size, npz_names, read_npz
 from casadi_ik.files.reading import parse_yaml, read_text
 from casadi_ik.integrations.datasets.postures import HandPoses
 from casadi_ik.kinematics.arm_hand import ArmHand
@@ -165,11 +165,8 @@ def recognise_layout(path: Path) -> str:
         is_isaac = isinstance(content, dict) and content.get("format") == ISAAC_GRASP
         return ISAAC_GRASP if is_isaac else ""
     if kind == ".npz":
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                return "poses" if set(POSE_KEYS) & set(archive.files) else ""
-        except (OSError, ValueError, EOFError, KeyError):
-            return ""  # another reader reports the problem
+        # Of a file that cannot be read another reader reports the problem.
+        return "poses" if set(POSE_KEYS) & {*(npz_names(path) or ())} else ""
     if kind == ".npy":
         try:
             shape = np.lib.format.open_memmap(path, mode="r").shape

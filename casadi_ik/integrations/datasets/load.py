@@ -18,6 +18,7 @@ from casadi_ik.errors import (
 )
 from casadi_ik.files.arrays import Array
 from casadi_ik.files.limits import LIMITS, RAISE_HINT, scaled_limit
+from casadi_ik.files.number_files import npz_names
 from casadi_ik.files.reprs import RecordReprMixin
 from casadi_ik.integrations.datasets.gripper_grasps import (
     GRIPPER_READERS,
@@ -363,11 +364,8 @@ def _convention_of_joint_names(robot: ArmHand, names: tuple[str, ...]) -> Conven
 def _has_targets(path: Path) -> bool:
     if path.suffix.lower() != ".npz":
         return False
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return "points" in archive.files
-    except (OSError, ValueError, EOFError, KeyError):
-        return True  # the reader of targets reports the problem
+    names = npz_names(path)
+    return names is None or "points" in names  # the reader of targets reports a damaged file
 
 
 def _candidates_of_hand(
