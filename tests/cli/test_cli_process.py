@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -21,7 +22,6 @@ from commands import COMMANDS, GROUPS, load
 from processes import POSIX
 
 import casadi_ik as ik
-from casadi_ik.integrations.datasets import LAYOUT_NAMES
 
 PROGRAM = [sys.executable, "-m", "casadi_ik"]
 ROBOT = "kuka_lwr_barrett"
@@ -83,8 +83,8 @@ def test_help_texts_are_short(name: str) -> None:
 
 
 def test_layouts_of_candidates_are_listed(run: Command) -> None:
-    text = run("choose", "--help").fine().out
-    assert all(name in text for name in LAYOUT_NAMES)
+    words = re.findall(r"\w+", run("choose", "--help").fine().out)
+    assert {"dexgraspnet", "multidex", "isaac_grasp", "acronym", "table"} <= set(words)
 
 
 def test_misspelt_options_are_suggested(run: Command) -> None:

@@ -42,15 +42,15 @@ CORE_ONLY = """
 import sys
 for name in {modules!r}:
     sys.modules[name] = None
-from casadi_ik.app.cli.main import main
-code = main(["solve", "cup", "--scene", "table", "--log", {log!r}])
-code = code or main(["log", "info", {log!r}])
 import casadi_ik as ik
+scene = ik.load_scene("table")
+solver = ik.Solver(ik.load_robot("kuka_lwr_barrett"), scene=scene)
+assert solver.solve(ik.load_grasp("cup"), log={log!r}).success
+assert len(ik.logs.open({log!r}).solves()) == 1
 try:
     ik.load_surface({mesh!r})
 except ik.errors.MissingExtraError as error:
     print(error)
-sys.exit(code)
 """
 
 

@@ -1,7 +1,5 @@
 """Grasps of surfaces, confirmed by the public solver and exact distances."""
 
-import io
-
 import numpy as np
 import pytest
 import trimesh
@@ -9,7 +7,6 @@ from touch_cases import PLACE, solver_of, surface_of
 
 import casadi_ik as ik
 from casadi_ik import errors
-from casadi_ik.app.cli.planning import grasps_npz
 
 
 def test_every_grasp_is_confirmed_in_the_scene(grasps_found):
@@ -19,16 +16,6 @@ def test_every_grasp_is_confirmed_in_the_scene(grasps_found):
         assert solver.solve(grasp.grasp, q0=grasp.q).success
         assert grasp.clearance >= 0
         assert list(grasps.counts.values()) == sorted(grasps.counts.values(), reverse=True)
-
-
-def test_written_grasps_match(grasps_found):
-    solver, grasps = grasps_found
-    stored = np.load(io.BytesIO(grasps_npz(grasps, solver.robot.fingers)))
-    arrays = {name: stored[name] for name in ("points", "normals", "balls") if name in stored}
-    batch = solver.solve_batch(**arrays, q0=stored["q"])
-    assert batch.success.all()
-    np.testing.assert_allclose(batch.q, stored["q"], atol=1e-9)
-    assert np.nanmax(batch.position_error) < 1e-9
 
 
 def test_neighbouring_obstacles_are_avoided(surface):
