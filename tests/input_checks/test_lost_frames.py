@@ -34,6 +34,7 @@ LOST_FRAMES = {
     "one place": np.tile([0.3, 0.2, 0.1], (21, 1)),
     "an identity": np.eye(21, 3),
     "infinity": np.full((21, 3), np.inf),
+    "a coordinate of a tip is NaN": with_key(4, np.array([0.6, np.nan, 0.9])),
     "a tip at zero": with_key(8, np.zeros(3)),
     "a tip at minus one": with_key(4, -np.ones(3)),
     "a wrist at zero": with_key(0, np.zeros(3)),

@@ -234,20 +234,6 @@ def test_low_pass(robot, retarget):
     np.testing.assert_allclose([m[0] for m in shifts], 0.1 * (1 - 0.75 ** np.arange(1, 4)))
 
 
-def test_nan_frame_is_ignored(robot, retarget):
-    retargeter = ik.motion.Retargeter(retarget(robot), robot)
-    target_before = retargeter(hand(0.4, np.zeros(3)))
-    bad = hand(0.4, np.zeros(3))
-    bad[4, 1] = np.nan
-    target = retargeter(bad)
-    assert target.palm is None
-    assert np.isnan(target.points).all()
-    after = retargeter(hand(0.4, np.zeros(3)))
-    np.testing.assert_array_equal(after.points, target_before.points)
-    with pytest.raises(ik.errors.InputError, match=r"keypoints:.*\(20, 3\).*\(21, 3\)"):
-        retargeter(bad[:20])
-
-
 def test_arm_and_hand_follow_a_person(robot, retarget):
     """Fingertips and wrist follow a person who moves like the robot, at any scale."""
     excursion = 0.15 * np.sin(np.linspace(0, np.pi, 120))[:, None] * np.sin(np.arange(14))

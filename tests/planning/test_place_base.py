@@ -103,8 +103,8 @@ def test_the_command_writes_the_placement(palms, tmp_path):
     assert data["count"] == sum(data["reached"]) <= data["upper_bound"] <= 10
     # Without a region, and with configurations instead of palm poses.
     np.savez(tmp_path / "found.npz", q=ik.load_robot("ur5e").random(np.random.default_rng(0), 4))
-    found = [str(tmp_path / "found.npz"), "--robot", "ur5e", "--resolution", "0.5"]
-    assert main(["place-base", *found, "--out", str(out)]) == 0
+    words = [str(tmp_path / "found.npz"), "--robot", "ur5e", "--resolution", "0.5"]
+    assert main(["place-base", *words, "--out", str(out)]) == 0
     assert json.loads(out.read_text())["count"] == 4
 
 

@@ -54,13 +54,13 @@ def about_z(degrees: float) -> Array:
     return frame_matrix(Frame(rpy=(0.0, 0.0, np.deg2rad(degrees))))
 
 
-def write_package(site: Path, error: float = 0.0, turned: bool = False) -> None:
+def write_package(site: Path, error: float = 0.0, is_turned: bool = False) -> None:
     """Write an installed package with a Panda whose frames differ from those of the robot.
 
     Args:
         site: Folder of installed packages.
         error: Displacement of an axis [m].
-        turned: Whether the base is turned by 90 deg, and the zero of the second axis by 30 deg.
+        is_turned: Whether the base is turned by 90 deg, and the zero of the second axis by 30 deg.
     """
     info = site / "made_up_robots-1.0.dist-info"
     info.mkdir()
@@ -77,7 +77,7 @@ def write_package(site: Path, error: float = 0.0, turned: bool = False) -> None:
     for i, joint in enumerate(joints, 1):
         placement = (inverse(SHIFT) if i > 1 else np.eye(4)) @ joint.placement @ SHIFT
         placement[:3, 3] += error * (i == 4) * placement[:3, 0]
-        if turned and i <= 2:
+        if is_turned and i <= 2:
             turn = about_z(-90.0) if i == 1 else about_z(-30.0)
             placement = turn @ placement if i == 1 else placement @ turn
         xyz, rpy = placement[:3, 3], roll_pitch_yaw(placement[:3, :3])
@@ -124,14 +124,14 @@ def test_meshes_of_an_installed_package_are_placed_and_colored(site: Path) -> No
 
 
 def test_frames_and_zeros_may_differ(site: Path) -> None:
-    write_package(site, turned=True)
+    write_package(site, is_turned=True)
     description = ik.load_robot("panda").description
     entry = TABLE.robots["panda"][0]
     assert not package_meshes(description, TABLE).by_link
-    turned = structs.replace(
+    turned_entry = structs.replace(
         entry, rpy=(0.0, 0.0, np.pi / 2), zeros={"panda_joint_2": np.deg2rad(30.0)}
     )
-    meshes = package_meshes(description, MeshTable(TABLE.packages, {"panda": [turned]}))
+    meshes = package_meshes(description, MeshTable(TABLE.packages, {"panda": [turned_entry]}))
     for i in range(1, 8):
         (part,) = [part for part in meshes.by_link[f"panda_link_{i}"] if part.color]
         assert part.mesh.points.mean(axis=0) == pytest.approx(SHIFT[:3, 3], abs=1e-6)
@@ -206,10 +206,10 @@ def test_hulls_have_the_size_of_the_robot(site: Path, name: str) -> None:
     for link in meshes.covered_links:
         hull = np.concatenate([part.mesh.points for part in meshes.by_link[link]])
         solid = [body.surface.points for body in shapes if body.name == link]
-        drawn = hull @ poses[link][:3, :3].T + poses[link][:3, 3]
+        placed_hull = hull @ poses[link][:3, :3].T + poses[link][:3, 3]
         for bound in (np.min, np.max):
             # Collision shapes enclose a link with an excess of up to 78 mm.
-            assert bound(drawn, axis=0) == pytest.approx(
+            assert bound(placed_hull, axis=0) == pytest.approx(
                 bound(np.concatenate(solid), axis=0), abs=0.06
             )
 
