@@ -424,12 +424,16 @@ class _PlacementSearch:
             queue.sort(key=lambda box: box[0])
             batch = [queue.pop() for _ in range(min(PLACEMENT_PARAMETERS.batch, len(queue)))]
             batch = [box for box in batch if box[0] > self.best_count]
-            for bound, lower, upper, palms in self._bounded(batch):
-                if bound <= self.best_count:
-                    continue
+            boxes = self._bounded(batch)
+            if boxes:
+                # A base takes ten times as long as the bound of a box.
+                _, lower, upper, palms = max(boxes, key=lambda box: box[0])
                 base, count = self.evaluate((lower + upper) / 2, palms)
                 if count > self.best_count and self._score.stands_free(base):
                     self.best, self.best_count = base, count
+            for bound, lower, upper, palms in boxes:
+                if bound <= self.best_count:
+                    continue
                 widths = (upper - lower) * sizes
                 widest = int(np.argmax(widths))
                 if widths[widest] <= self._resolution:
