@@ -123,6 +123,7 @@ class FollowSources:
         return {f"src/{self.prefix}_follow.c": render_template("follow.c", marks)}, substitutes
 
     def _constants(self, cycle: Cycle) -> str:
+        """Return the C definitions of sizes, offsets, parameters and arrays of the follower."""
         robot, f = self.robot, len(self.robot.fingers)
         integers = {
             "N_FINGERS": f,
@@ -341,6 +342,7 @@ class SolverSources:
         )
 
     def _scene_kernels(self) -> tuple[KernelSource, ...]:
+        """Return the kernels of the collision check; none without a scene."""
         scene = self.scene
         if scene is None:
             return ()
@@ -360,6 +362,15 @@ class SolverSources:
         constants: str = "",
         extra: int = 0,
     ) -> KernelSource:
+        """Return the C file of a graph and of the loop that calls it.
+
+        Args:
+            name: Name of the kernel.
+            driver: Name of the C file with the loop.
+            kernel: The graph, or a kernel with a graph.
+            constants: C definitions that the loop needs.
+            extra: Numbers of work memory beyond those of the graph.
+        """
         is_graph = isinstance(kernel, FunctionGraph)
         function: Any = row_major(kernel.function) if is_graph else kernel.function
         if driver in ("map", "lookup"):
@@ -471,6 +482,7 @@ class SolverSources:
         return (self.robot.lower, self.robot.upper) if self.single is None else self.single.bounds
 
     def _settings(self) -> Array:
+        """Return the settings of the method, with tolerances and limits of the precision."""
         f = len(self.robot.fingers)
         no_contacts, tolerance = np.zeros((1, f, 3)), self.tolerance
         layout = settings_layout(self.robot.description)

@@ -178,6 +178,7 @@ class FrameFilter:
         return True
 
     def _problem(self, frame: Array) -> str:
+        """Return why a frame is rejected; "" if it is accepted."""
         reason = lost_frame_reason(frame, self._checked_keys, self._wrist)
         if reason:
             return reason

@@ -211,6 +211,7 @@ def _stl_size(data: bytes) -> int:
 
 
 def _parse_mesh(data: bytes, kind: str) -> list[MeshPart]:
+    """Return the parts of a mesh file without unused vertices."""
     with warnings.catch_warnings(), np.errstate(all="ignore"), _silent("trimesh.util"):
         warnings.simplefilter("ignore")
         raw_parts = _read_collada(data) if kind == "dae" else _read_trimesh(data, kind)
@@ -238,6 +239,7 @@ def _silent(logger: str) -> Iterator[None]:
 
 
 def _read_trimesh(data: bytes, kind: str) -> list[tuple[Any, Any, str]]:
+    """Return vertices, faces and colour of each part of a mesh file that trimesh reads."""
     with optional_import("meshes"):
         import trimesh
 
@@ -456,6 +458,7 @@ def _read_columns(stream: IO[bytes], columns: list[int], count: int | None) -> A
 
 
 def _read_with_header(path: Path, read_header: Callable[[IO[bytes]], _Header]) -> Array:
+    """Return the points (k, 3) of a PLY or PCD file."""
     with path.open("rb") as stream:
         header = read_header(stream)
         names = [name for name, _, _ in header.fields]
@@ -539,6 +542,7 @@ def _read_words(stream: IO[bytes]) -> list[str]:
 
 
 def _read_ply_header(stream: IO[bytes]) -> _Header:
+    """Return the header of a PLY file; vertices must be its first element."""
     if _read_words(stream) != ["ply"]:
         raise ValueError("is not a PLY file")
     forms = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -564,6 +568,7 @@ def _read_ply_header(stream: IO[bytes]) -> _Header:
 
 
 def _read_pcd_header(stream: IO[bytes]) -> _Header:
+    """Return the header of a PCD file."""
     entries: dict[str, list[str]] = {}
     for _ in range(LIMITS.cloud_head):
         words = _read_words(stream)

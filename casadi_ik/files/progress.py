@@ -95,6 +95,7 @@ def _in_notebook() -> bool:
 
 
 def _notebook(count: int) -> Callable[[int | None, float], None]:
+    """Return a function that draws a progress bar in a notebook, or clears it (None)."""
     from IPython.display import HTML, display
 
     handle: Any = None
@@ -112,6 +113,7 @@ def _notebook(count: int) -> Callable[[int | None, float], None]:
 
 
 def _terminal(count: int) -> Callable[[int | None, float], None]:
+    """Return a function that draws a progress bar on stderr, or removes it (None)."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -166,6 +166,7 @@ def _is_instance(value: Any, type_: Any) -> bool:
 
 
 def _check_unit(value: Any, allowed: Dimension, path: Path, key: str, owner: Any) -> None:
+    """Check that a number with a unit has the dimension of its field."""
     parsed = quantity(value)
     if parsed is None or not parsed[1]:
         return
@@ -243,6 +244,7 @@ def key_texts(struct: type[Any]) -> dict[str, str]:
 
 
 def _schema(type_: Any, definitions: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON Schema of a type; structs are added to `definitions`."""
     origin, args = get_origin(type_), get_args(type_)
     if origin is Annotated:
         mark = next((arg for arg in args[1:] if isinstance(arg, Dimension)), None)
@@ -308,6 +310,7 @@ def _reference(struct: type[msgspec.Struct], definitions: dict[str, Any]) -> dic
 
 
 def _object(struct: type[msgspec.Struct], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Return the JSON Schema of a struct: its keys with descriptions and defaults."""
     texts, hints = key_texts(struct), get_type_hints(struct, include_extras=True)
     properties: dict[str, Any] = {}
     required: list[str] = []

@@ -128,6 +128,7 @@ def check_installed(cluster: str | None) -> None:
 
 
 def _client(address: str) -> Client:
+    """Return a client of the Dask scheduler at an address."""
     from dask.distributed import Client
 
     try:
@@ -140,6 +141,7 @@ def _client(address: str) -> Client:
 
 
 def _check_workers(client: Client, address: str, packages: tuple[str, ...]) -> None:
+    """Check that all machines of a cluster have the versions of this one."""
     try:
         client.wait_for_workers(1, timeout=CLUSTER_TIMEOUT)
     except TimeoutError as error:
@@ -450,6 +452,7 @@ def columns(solution: BatchSolution) -> dict[str, np.ndarray]:
 
 
 def _diagnoses(diagnoses: tuple[Diagnosis | None, ...], n: int) -> dict[str, np.ndarray]:
+    """Return diagnoses as arrays by name; rows without a diagnosis are empty or NaN."""
     count = len(diagnoses)
     arrays = {
         "reason": np.zeros(count, dtype=REASON_DTYPE),

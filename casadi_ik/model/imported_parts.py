@@ -206,6 +206,7 @@ class _PartJoints:
         return joint.type == "continuous" and not limited
 
     def _joint(self, joint: TreeJoint) -> Joint:
+        """Return a joint of the robot; a locked joint becomes a fixed one."""
         part = "arm" if joint.name in self._arm else "hand"
         coupling = self._coupling(joint)
         position = self._fixed_position(joint.name)
@@ -218,21 +219,22 @@ class _PartJoints:
             kind = moving_type
             low, high = self._limits(joint.name)
         return Joint(
-            joint.name,
-            joint.parent,
-            joint.child,
-            kind,
-            read_only(placement),
-            read_only(joint.axis),
-            low,
-            high,
-            joint.velocity,
-            coupling,
-            part,
-            joint.effort,
+            name=joint.name,
+            parent=joint.parent,
+            child=joint.child,
+            type=kind,
+            placement=read_only(placement),
+            axis=read_only(joint.axis),
+            lower=low,
+            upper=high,
+            velocity=joint.velocity,
+            coupling=coupling,
+            part=part,
+            effort=joint.effort,
         )
 
     def _check_mimic_chain(self, name: str) -> None:
+        """Check that the joints that a joint mimics end at a motor."""
         chain: list[str] = []
         current: str | None = name
         while current is not None and current in self._tree.by_name:
@@ -284,6 +286,7 @@ class _PartJoints:
         return self._ranges[name]
 
     def _derive_limits(self, joint: TreeJoint) -> tuple[float, float]:
+        """Return the limits of a joint: stated, those of the file, or derived from its leader."""
         limits = self._stated.get(joint.name, joint.limits)
         if limits is not None:
             return limits

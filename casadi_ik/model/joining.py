@@ -166,6 +166,7 @@ def build_fingers(
 
 
 def _finger(name: str, hand: RobotPart, flat: FlatJoints, side: str) -> Finger:
+    """Return a finger whose pad, joints and frames are those of the flattened hand."""
     entry = hand.pads[name]
     location = f"{hand.location}fingers.{name.removeprefix(side)}"
     link, pose = flat.anchors[require_name(entry.link, hand.links, "link", f"{location}.link")]
@@ -187,13 +188,13 @@ def _finger(name: str, hand: RobotPart, flat: FlatJoints, side: str) -> Finger:
         )
     normal = np.asarray(entry.normal, dtype=float) / length
     return Finger(
-        name,
-        link,
-        read_only(pose @ frame_matrix(entry)),
-        read_only(normal),
-        tuple(chain[::-1]),
-        read_only(_tangent(entry.tangent, normal, location)),
-        entry.pad.radius if isinstance(entry.pad, BallPad) else 0.0,
+        name=name,
+        link=link,
+        placement=read_only(pose @ frame_matrix(entry)),
+        normal=read_only(normal),
+        joints=tuple(chain[::-1]),
+        tangent=read_only(_tangent(entry.tangent, normal, location)),
+        radius=entry.pad.radius if isinstance(entry.pad, BallPad) else 0.0,
     )
 
 

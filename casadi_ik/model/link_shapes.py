@@ -245,6 +245,7 @@ def capsules_of(shape: ShapeEntry) -> list[tuple[Array, Array, float]]:
 
 
 def _box_capsules(size: Array, pose: Array) -> list[tuple[Array, Array, float]]:
+    """Return capsules (centre, half axis, radius) that cover a box, along its longest edge."""
     order = np.argsort(size, kind="stable")
     shortest, middle, longest = (int(i) for i in order)
     # Bars are about as wide as the box is thick, unless the box is a thin plate.

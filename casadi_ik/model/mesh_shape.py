@@ -91,6 +91,7 @@ def _pose(element: Element, path: Path) -> Array:
 
 
 def _geometry(element: Element, path: Path) -> Triangles:
+    """Return the scaled triangles of the geometry of a link element."""
     geometry = element.find("geometry")
     shape = None if geometry is None or len(geometry) != 1 else geometry[0]
     if shape is None:
@@ -112,6 +113,7 @@ def _geometry(element: Element, path: Path) -> Triangles:
 
 
 def _simple(shape: Element, path: Path) -> Triangles:
+    """Return the triangles of a box, sphere or cylinder."""
     with optional_import("meshes"):
         import trimesh
 

@@ -267,6 +267,8 @@ def _mirrored(pose: Array) -> Array:
 
 
 def _mirrored_pad(pad: PadEntry) -> PadEntry:
+    """Return the mirror image of a contact frame."""
+
     def mirror(vector: tuple[float, ...]) -> tuple[float, ...]:
         return vector[0], -vector[1], vector[2]
 
@@ -324,6 +326,7 @@ def _renamed(part: RobotPart, link: Callable[[str], str], mover: Callable[[str],
 
 
 def _prefixed(name: str, arm_names: Collection[str], hand_names: Collection[str]) -> str:
+    """Return a name of a hand, with prefixes until neither arm nor hand has it."""
     if name not in arm_names:
         return name
     while name in arm_names or name in hand_names:
@@ -406,6 +409,7 @@ def _joints(
 
 
 def _joint(entry: JointEntry, part: str) -> Joint:
+    """Return the joint of an entry of a description file."""
     axis = np.asarray(entry.axis, dtype=float)
     return Joint(
         name=entry.name,

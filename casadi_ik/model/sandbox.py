@@ -123,74 +123,79 @@ def evaluate(expression: str, names: Mapping[str, Any], extra_functions: Mapping
     variables: dict[str, Any] = {}  # variables of comprehensions
     source = expression.strip()
 
-    def value(node: ast.AST) -> Any:
+    def evaluate_node(node: ast.AST) -> Any:
+        """Return the value of a node of the syntax tree."""
         match node:
             case ast.Expression(body=body):
-                return value(body)
+                return evaluate_node(body)
             case ast.Constant(value=constant):
                 return checked(constant, node)
             case ast.Name(id=name):
                 return checked(look_up(name), node)
             case ast.UnaryOp(op=op, operand=operand) if type(op) in OPERATORS:
-                return OPERATORS[type(op)](value(operand))
+                return OPERATORS[type(op)](evaluate_node(operand))
             case ast.BinOp(left=left, op=op, right=right) if type(op) in OPERATORS:
-                return OPERATORS[type(op)](value(left), value(right))
+                return OPERATORS[type(op)](evaluate_node(left), evaluate_node(right))
             case ast.BoolOp(op=op, values=values):
                 result = None
                 for operand in values:
-                    result = value(operand)
+                    result = evaluate_node(operand)
                     if bool(result) == isinstance(op, ast.Or):
                         break
                 return result
             case ast.Compare(left=left, ops=ops, comparators=comparators):
-                previous = value(left)
+                previous = evaluate_node(left)
                 for op, comparator in zip(ops, comparators, strict=True):
-                    current = value(comparator)
+                    current = evaluate_node(comparator)
                     if not OPERATORS[type(op)](previous, current):
                         return False
                     previous = current
                 return True
             case ast.IfExp(test=test, body=body, orelse=orelse):
-                return value(body if value(test) else orelse)
+                return evaluate_node(body if evaluate_node(test) else orelse)
             case ast.List(elts=elts):
-                return [value(element) for element in elts]
+                return [evaluate_node(element) for element in elts]
             case ast.Tuple(elts=elts):
-                return tuple(value(element) for element in elts)
+                return tuple(evaluate_node(element) for element in elts)
             case ast.Dict(keys=keys, values=values) if None not in keys:
-                return {value(k): value(v) for k, v in zip(keys, values, strict=True) if k}
+                return {
+                    evaluate_node(k): evaluate_node(v)
+                    for k, v in zip(keys, values, strict=True)
+                    if k
+                }
             case ast.Subscript(value=sequence, slice=ast.Slice(lower=low, upper=high, step=step)):
-                bounds = (None if x is None else value(x) for x in (low, high, step))
-                return value(sequence)[slice(*bounds)]
+                bounds = (None if x is None else evaluate_node(x) for x in (low, high, step))
+                return evaluate_node(sequence)[slice(*bounds)]
             case ast.Subscript(value=container, slice=index):
-                return checked(value(container)[value(index)], node)
+                return checked(evaluate_node(container)[evaluate_node(index)], node)
             case ast.Attribute(value=owner, attr=name):  # a key of a dictionary or namespace
-                mapping = look_up(owner.id) if isinstance(owner, ast.Name) else value(owner)
+                mapping = look_up(owner.id) if isinstance(owner, ast.Name) else evaluate_node(owner)
                 if not isinstance(mapping, dict):
                     raise refused(node)
                 return checked(mapping[name], node)
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in functions:
-                return functions[name](*map(value, args))
+                return functions[name](*map(evaluate_node, args))
             case ast.Call(func=ast.Name(id="dict"), args=[], keywords=pairs) if all(
                 pair.arg for pair in pairs
             ):
-                return {pair.arg: value(pair.value) for pair in pairs}
+                return {pair.arg: evaluate_node(pair.value) for pair in pairs}
             case ast.Call(
                 func=ast.Attribute(value=ast.Name(id=prefix), attr=name), args=args, keywords=[]
             ) if prefix in NAMESPACES and name in functions:
-                return functions[name](*map(value, args))
+                return functions[name](*map(evaluate_node, args))
             case ast.Call(
                 func=ast.Name(id="isinstance")
                 | ast.Attribute(value=ast.Name(id="python"), attr="isinstance"),
                 args=[argument, ast.Name(id=kind)],
                 keywords=[],
             ) if kind in TYPES_BY_NAME:
-                return isinstance(value(argument), TYPES_BY_NAME[kind])
+                return isinstance(evaluate_node(argument), TYPES_BY_NAME[kind])
             case ast.Call(func=ast.Attribute(value=owner, attr=name), args=args, keywords=[]):
-                instance = value(owner)
+                instance = evaluate_node(owner)
                 kinds = [kind for kind in CALLABLE_METHODS if isinstance(instance, kind)]
                 if not kinds or name not in CALLABLE_METHODS[kinds[0]]:
                     raise refused(node)
-                result = getattr(kinds[0], name)(instance, *map(value, args))
+                result = getattr(kinds[0], name)(instance, *map(evaluate_node, args))
                 return list(result) if kinds[0] is dict and name != "get" else result
             case (
                 ast.ListComp(elt=elt, generators=[ast.comprehension(target, iterable, tests)])
@@ -198,21 +203,22 @@ def evaluate(expression: str, names: Mapping[str, Any], extra_functions: Mapping
             ):
                 targets = target.elts if isinstance(target, ast.Tuple) else [target]
                 results = []
-                for item in value(iterable):
+                for item in evaluate_node(iterable):
                     items = item if isinstance(target, ast.Tuple) else (item,)
                     for variable, part in zip(targets, items, strict=True):
                         if not isinstance(variable, ast.Name):
                             raise refused(node)
                         variables[variable.id] = part
-                    if all(value(test) for test in tests):
-                        results.append(value(elt))
+                    if all(evaluate_node(test) for test in tests):
+                        results.append(evaluate_node(elt))
                 return results
             case ast.Set(elts=elts):
-                return {value(element) for element in elts}
+                return {evaluate_node(element) for element in elts}
             case _:
                 raise refused(node)
 
     def look_up(name: str) -> Any:
+        """Return the value of a variable or name."""
         if name in variables:
             return variables[name]
         try:
@@ -221,18 +227,20 @@ def evaluate(expression: str, names: Mapping[str, Any], extra_functions: Mapping
             raise RefusedError(f"name {name!r} is not defined") from None
 
     def checked(result: Any, node: ast.AST) -> Any:
+        """Return a value of one of `VALUE_TYPES`; refuse others."""
         if not isinstance(result, VALUE_TYPES):
             raise refused(node)
         return result
 
     def refused(node: ast.AST) -> RefusedError:
+        """Return the error for a node that is not evaluated."""
         text = ast.get_source_segment(source, node) or expression
         return RefusedError(
             f"{text!r} is not evaluated; expected arithmetic, comparisons, functions of numbers, "
             "and methods of strings and lists"
         )
 
-    return value(ast.parse(source, mode="eval"))
+    return evaluate_node(ast.parse(source, mode="eval"))
 
 
 def package_folders(name: str, file: Path) -> tuple[list[Path], list[Path]]:
@@ -305,6 +313,7 @@ def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> 
             break
 
     def find(name: str) -> str:
+        """Return the folder of a package, which the file may read from now on."""
         nearby, in_environment = package_folders(name, path)
         # A neighbouring folder that only has the name may be unrelated to the file.
         above = path.resolve().parents
@@ -319,6 +328,7 @@ def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> 
         return str(folders[-1])
 
     def argument(name: str, args: Mapping[str, Any] | None = None) -> Any:
+        """Return the value of an argument of the file."""
         values = library.substitution_args_context["arg"] if args is None else args
         if name not in values and name == "name":
             return path.name.partition(".")[0]
@@ -332,6 +342,7 @@ def expand_xacro(path: Path, arguments: Mapping[str, str], notes: list[str]) -> 
     call_macro = library.handle_macro_call
 
     def call(node: Any, macros: Any, symbols: Any) -> Any:
+        """Call a macro without its undeclared parameters."""
         if node.tagName.startswith("xacro:") and node.tagName != "xacro:call":
             with contextlib.suppress(KeyError):
                 macro = library.resolve_macro(node.tagName[len("xacro:") :], macros, symbols)[2]

@@ -401,6 +401,7 @@ def _warn_of_units(joints: Mapping[str, Element], path: Path) -> None:
 
 
 def _root(links: list[str], joints: dict[str, Element], path: Path) -> str:
+    """Return the base link of a URDF after checking that its joints form a tree."""
     parents: dict[str, str] = {}
     for name, joint in joints.items():
         child = joint.find("child").get("link", "")  # type: ignore[union-attr]
@@ -429,6 +430,7 @@ def _root(links: list[str], joints: dict[str, Element], path: Path) -> str:
 
 
 def _joint(element: Element, name: str, location: str) -> TreeJoint:
+    """Return the joint of an element of a URDF."""
     kind, limit_element = element.get("type", ""), element.find("limit")
     axis = np.array([0.0, 0.0, 1.0])
     if kind in ("revolute", "continuous", "prismatic"):
@@ -441,16 +443,16 @@ def _joint(element: Element, name: str, location: str) -> TreeJoint:
     placement = origin_pose(element)
     assert placement is not None  # _check_joint has checked its vectors
     return TreeJoint(
-        name,
-        required_attribute(element.find("parent"), "link", location),
-        required_attribute(element.find("child"), "link", location),
-        kind,
-        placement,
-        axis,
-        _limits(limit_element, location) if kind in ("revolute", "prismatic") else None,
-        velocity,
-        _mimic(element, location),
-        effort,
+        name=name,
+        parent=required_attribute(element.find("parent"), "link", location),
+        child=required_attribute(element.find("child"), "link", location),
+        type=kind,
+        placement=placement,
+        axis=axis,
+        limits=_limits(limit_element, location) if kind in ("revolute", "prismatic") else None,
+        velocity=velocity,
+        coupling=_mimic(element, location),
+        effort=effort,
     )
 
 
@@ -476,6 +478,7 @@ def _stated_limits(limit_element: Element | None, location: str) -> list[float |
 
 
 def _mimic(element: Element, location: str) -> Coupling | None:
+    """Return the coupling of a joint that mimics another one; None for other joints."""
     mimic = element.find("mimic")
     if mimic is None or element.get("type") == "fixed":
         return None
@@ -515,6 +518,10 @@ def read_tree(path: Path, xacro: bool | Sequence[str] = False) -> RobotTree:
 
 @lru_cache(maxsize=8)
 def _read(path: Path, _: int, xacro: bool, arguments: tuple[str, ...]) -> RobotTree:
+    """Return the tree of a file, which is cached.
+
+    The second argument is the time of the last change, so that a changed file is read again.
+    """
     text = read_robot_file(path)
     element, notes = parse_xml(text, path), ()
     if xacro and element.tag == "robot":

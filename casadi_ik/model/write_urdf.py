@@ -110,6 +110,7 @@ def _leaders(robot: RobotDescription) -> dict[str, tuple[str, float, float]]:
 def _add_visuals(
     element: ElementTree.Element, link: str, robot: RobotDescription, part: dict[str, str]
 ) -> None:
+    """Add cylinders from a link to its child joints and fingertips."""
     endpoints = [joint.placement[:3, 3] for joint in robot.joints if joint.parent == link]
     endpoints += [finger.placement[:3, 3] for finger in robot.fingers if finger.link == link]
     for end in endpoints:

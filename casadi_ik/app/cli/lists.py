@@ -253,6 +253,7 @@ def _completions(option: Option) -> list[str]:
 
 
 def _bash() -> str:
+    """Return the completion script of bash."""
     cases = []
     for group in GROUPS:
         words = [name.rpartition(" ")[2] for name in command_names(group)]
@@ -276,6 +277,7 @@ def _zsh() -> str:
 
 
 def _fish() -> str:
+    """Return the completion script of fish."""
     lines = []
     for name, (_, summary) in COMMANDS.items():
         group, _, word = name.rpartition(" ")

@@ -45,6 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(words: Sequence[str]) -> int:
     # Imported after the signal handlers are installed, so that Ctrl-C during the import also ends
     # in one line.
+    """Run a command and return its exit code."""
     from casadi_ik.app.cli.outputs import print_message
     from casadi_ik.app.cli.table import Exit, parse
 
@@ -163,6 +164,7 @@ def _show(report: RenderableType) -> None:
 
 
 def _render(report: RenderableType) -> None:
+    """Print the parts of a report on stdout."""
     from rich.console import Console, ConsoleOptions
     from rich.segment import Segment
 

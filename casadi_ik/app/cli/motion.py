@@ -267,6 +267,7 @@ def _load_goal(args: Arguments) -> tuple[Path, Grasp | ChosenPosture]:
 
 
 def _motion_report(reach_result: Reach, motion: Motion, units: Units) -> dict[str, str]:
+    """Return the report of a planned motion."""
     part, times = motion.notes["part"], motion.times
     end_times = {name: float(times[part == name][-1]) for name in PARTS if (part == name).any()}
     starts = [0.0, *end_times.values()]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import shlex
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from rich.console import Group, RenderableType
+from rich.table import Table
 from rich.text import Text
 
 from casadi_ik.app.cli import options as opt
@@ -37,6 +38,7 @@ from casadi_ik.integrations.importing.reference_kinematics import largest_differ
 from casadi_ik.integrations.importing.robot_import import ImportResult
 from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
 from casadi_ik.kinematics.arms.recognise import describe_arm, is_searched
+from casadi_ik.model.description import RobotDescription
 from casadi_ik.model.load_robot import load_description
 from casadi_ik.papers.chandra import calibration
 
@@ -175,6 +177,7 @@ def _differences(robot: ArmHand, import_result: ImportResult) -> dict[str, float
 def _import_report(
     robot: ArmHand, import_result: ImportResult, differences: dict[str, float]
 ) -> list[RenderableType]:
+    """Return the report of an import: choices, fingers and notes."""
     description, imported = robot.description, import_result.description
     arm = len(description.arm_actuators)
     count = len(description.actuators)
@@ -223,14 +226,32 @@ def _import_report(
             f"at most {1e3 * largest_excess(imported.shapes):.0f} mm beyond their meshes; "
             f"{len(imported.touching)} pairs may touch"
         )
+    notes = [Text(f"  {note}", "yellow") for note in _import_notes(import_result, arms)]
+    return [headline(True, "IMPORTED", summary), fields(pairs), _pad_table(import_result), *notes]
+
+
+def _pad_table(import_result: ImportResult) -> Table:
+    """Return the table of the fingers of an imported robot and their pads."""
+    hands = import_result.description.hands
     rows = table("finger", "pad on link", "joints", "point [mm]", "normal", right=("joints",))
-    fingers = [(h.side, *finger) for h in imported.hands for finger in h.pads.items()]
+    fingers = [(h.side, *finger) for h in hands for finger in h.pads.items()]
     for finger_chain, (side, name, pad) in zip(import_result.fingers, fingers, strict=True):
         # Adding 0.0 turns -0.0 into 0.0.
         point = " ".join(f"{round(1e3 * value, 1) + 0.0:.1f}" for value in pad.point)
         normal = " ".join(f"{round(value, 2) + 0.0:.2f}" for value in pad.normal.tolist())
         finger_name = f"{side}_{name}" if side else name
         rows.add_row(finger_name, pad.link, str(len(finger_chain.joints)), point, normal)
+    return rows
+
+
+def _import_notes(import_result: ImportResult, arms: Sequence[RobotDescription]) -> list[str]:
+    """Return the warnings of an import, and what its user has to check.
+
+    Args:
+        import_result: The imported robot.
+        arms: The robot as one arm-hand for each hand.
+    """
+    imported = import_result.description
     chosen_links = [hand.palm_link for hand in imported.hands if hand.reason == "--palm"]
     notes = [
         f"--palm: {warning}"
@@ -251,8 +272,7 @@ def _import_report(
         "pads, thumb, palm and home are guesses: check the lines marked GUESS, and delete the "
         "lines of links that are not fingers"
     )
-    yellow = [Text(f"  {note}", "yellow") for note in notes]
-    return [headline(True, "IMPORTED", summary), fields(pairs), rows, *yellow]
+    return notes
 
 
 @command(
@@ -321,6 +341,7 @@ def calibrate(args: Arguments) -> CommandResult:
 
 
 def _calibration_report(estimate: calibration.Calibration, units: Units) -> list[RenderableType]:
+    """Return the report of a calibration: errors, numbers and weak directions."""
     count = f"{len(estimate.parameters)} numbers from {len(estimate.weights)} poses"
     status = "ESTIMATED" if estimate.converged else "NOT CONVERGED"
     noise = f"{1e3 * estimate.noise[0]:.3f} mm"

@@ -292,6 +292,7 @@ def _load(
     scale: float | None,
     invalid: Invalid,
 ) -> Candidates:
+    """Return the candidates of a file of any layout; see `load_candidates`."""
     suffix = path.suffix.lower()
     gripper_layout = layout or recognise_layout(path)
     if gripper_layout == ISAAC_GRASP or gripper_layout in GRIPPER_READERS:
@@ -345,6 +346,7 @@ def _load(
 
 
 def _check_units(path: Path, grasps: Sequence[Grasp]) -> None:
+    """Refuse contacts that are so far from the object that they are in another unit."""
     for grasp in grasps:
         for finger, contact in grasp.contacts.items():
             distance = 0.0 if contact.point is None else float(np.linalg.norm(contact.point))
@@ -362,6 +364,7 @@ def _convention_of_joint_names(robot: ArmHand, names: tuple[str, ...]) -> Conven
 
 
 def _has_targets(path: Path) -> bool:
+    """Return True if a file is an npz file of targets instead of palm poses."""
     if path.suffix.lower() != ".npz":
         return False
     names = npz_names(path)
@@ -436,6 +439,7 @@ def _load_object(
 
 
 def _check_count(location: str, count: int) -> None:
+    """Refuse a file with too many grasps."""
     if count > scaled_limit(LIMITS.candidates):
         raise DescriptionError(
             f"{location}: found {count} grasps, expected at most {scaled_limit(LIMITS.candidates)} "
@@ -481,6 +485,7 @@ def _contacts_of_pads(
 
 
 def _grasps_of_targets(path: Path, fingers: tuple[str, ...]) -> list[Grasp]:
+    """Return the grasps of the rows of a target file."""
     grasps: list[Grasp] = []
     file = TargetFile(path, len(fingers))
     _check_count(str(path), file.rows())

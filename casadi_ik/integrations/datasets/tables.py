@@ -68,6 +68,7 @@ def read_table(path: Path) -> HandPoses:
     count = len(columns[POSITION_COLUMNS[0]])
 
     def block(column_names: tuple[str, ...]) -> Array:
+        """Return columns as a matrix (k, number of names)."""
         return (
             np.stack([columns[name] for name in column_names], axis=1)
             if column_names
@@ -83,6 +84,7 @@ def read_table(path: Path) -> HandPoses:
 
 
 def _read_csv(path: Path) -> dict[str, Array]:
+    """Return the columns of a CSV file by name; empty cells are NaN."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             names, *rows = [row for row in csv.reader(file) if row] or [[]]
@@ -109,6 +111,7 @@ def _read_csv(path: Path) -> dict[str, Array]:
 
 
 def _read_npz_table(path: Path) -> dict[str, Array]:
+    """Return the columns of an npz file by name."""
     columns: dict[str, Array] = {}
     for name, array in read_npz(path, LIMITS.table_bytes).items():
         if _is_ignored(name):
@@ -124,6 +127,7 @@ def _read_npz_table(path: Path) -> dict[str, Array]:
 
 
 def _read_parquet(path: Path) -> Mapping[str, Array]:
+    """Return the columns of a Parquet file by name; missing values are NaN."""
     pl = import_polars()
     try:
         scanned = pl.scan_parquet(path)

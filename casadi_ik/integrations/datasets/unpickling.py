@@ -214,6 +214,7 @@ def read_npy(path: Path) -> Any:
 
 
 def _npy_content(path: Path, file: BinaryIO) -> Any:
+    """Return the content of an npy file with pickled objects."""
     version = np.lib.format.read_magic(file)
     read_header = {
         (1, 0): np.lib.format.read_array_header_1_0,

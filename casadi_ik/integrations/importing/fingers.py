@@ -292,6 +292,7 @@ class _Phalanx:
 
 
 def _last_phalanx(part: RobotPart, finger: FingerChain, meshes: dict[str, IndexedMesh]) -> _Phalanx:
+    """Return the last phalanx of a finger with a mesh, or an assumed one without a mesh."""
     zero_poses = part_poses(part, {})
     for index in reversed(range(len(finger.joints))):
         joint = finger.joints[index]

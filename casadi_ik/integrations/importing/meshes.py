@@ -251,6 +251,7 @@ def _count_meshes(names: list[str]) -> str:
 def _urdf_meshes(
     element: Element, kind: str, links: Collection[str], problems: MeshProblems
 ) -> dict[str, list[ColoredMesh]]:
+    """Return the meshes of links by name; `kind` is "visual" or "collision"."""
     materials = {
         material.get("name", ""): _material_color(material)
         for material in element.findall("material")
@@ -357,6 +358,7 @@ def simple_mesh(kind: str, size: Array) -> IndexedMesh:
 
 
 def _mjcf_meshes(mujoco: Any, model: Any, visual: bool) -> dict[str, list[ColoredMesh]]:
+    """Return the visual or collision meshes by body; all meshes of a body that has no such."""
     parts_by_body: dict[int, list[tuple[bool, ColoredMesh]]] = {}
     for geom in range(model.ngeom):
         mesh = _geom_mesh(mujoco, model, geom)
@@ -377,6 +379,7 @@ def _mjcf_meshes(mujoco: Any, model: Any, visual: bool) -> dict[str, list[Colore
 
 
 def _geom_mesh(mujoco: Any, model: Any, geom: int) -> IndexedMesh | None:
+    """Return the mesh of a geom in its own frame; None if the geom has no surface to show."""
     kind, simple = int(model.geom_type[geom]), simple_geom(mujoco, model, geom)
     if simple is not None:
         return simple_mesh(simple[0], np.array(simple[1]))

@@ -105,6 +105,8 @@ class _ReferenceModel(Protocol):
 
 
 class _PinocchioModel:
+    """Forward kinematics of a URDF file by pinocchio."""
+
     def __init__(self, element: Element | None) -> None:
         assert element is not None  # of a URDF
         try:
@@ -120,6 +122,7 @@ class _PinocchioModel:
         self._data = self._model.createData()
 
     def link_poses(self, positions: Mapping[str, float]) -> dict[str, Array]:
+        """Return the pose (4, 4) of every link for positions of joints by name."""
         q = self._pin.neutral(self._model)
         for name, position in positions.items():
             if not self._model.existJointName(name):
@@ -138,11 +141,14 @@ class _PinocchioModel:
 
 
 class _MuJoCoModel:
+    """Forward kinematics of an MJCF file by MuJoCo."""
+
     def __init__(self, mujoco: Any, model: Any) -> None:
         self._mujoco, self._model = mujoco, model
         self._data = mujoco.MjData(model)
 
     def link_poses(self, positions: Mapping[str, float]) -> dict[str, Array]:
+        """Return the pose (4, 4) of every body for positions of joints by name."""
         model, data = self._model, self._data
         for joint in range(model.njnt):
             name = joint_name(model, joint)
