@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,7 @@ class ApproachPath:
     """Postures of an approach.
 
     Attributes:
-        coming: (k, n) postures of the straight motion with an open hand.
+        coming: (k, n) postures of the straight motion with an open hand, from the pre-grasp on.
         closing: (k, n) postures while the hand closes; the last one is the grasp.
     """
 
@@ -65,8 +64,8 @@ class ApproachFinder:
         """Return the approach to a solution; None if the arm cannot follow it.
 
         Args:
-            problem: Grasp.
-            q: (n,) its solution.
+            problem: Batch of one target, the grasp.
+            q: (n,) solution of the grasp.
             opening: Distance of the fingertips of the open hand from their contacts [m].
             distance: Length of the straight motion [m].
             directions: (f, 3) unit vectors of the approach of each finger's hand, base frame.
@@ -74,9 +73,10 @@ class ApproachFinder:
         robot = self._robot
         points, normals = robot.contacts(q)
         has_contact = ~np.isnan(problem.points[0, :, 0])
-        share = np.linspace(0.0, 1.0, self.postures)[:, None, None]
-        opened_tips = points - opening * share * normals
-        opening_path = self._follow(q, opened_tips, {}, has_contact)
+        fractions = np.linspace(0.0, 1.0, self.postures)[:, None, None]
+        # Pad normals point into the object, so the fingertips open against them.
+        opening_tips = points - opening * fractions * normals
+        opening_path = self._follow(q, opening_tips, {}, has_contact)
         q_open = opening_path[-1]
         if not self._runner.cycle.palms:
             return ApproachPath(q_open[None], opening_path[::-1])
@@ -91,14 +91,14 @@ class ApproachFinder:
             shift: (3,) translation, or (f, 3) with equal rows for the fingers of a hand, base frame
                 [m].
         """
-        robot, share = self._robot, np.linspace(0.0, 1.0, self.postures)[:, None, None]
+        robot, fractions = self._robot, np.linspace(0.0, 1.0, self.postures)[:, None, None]
         tips, palms = robot.contacts(q)[0], dict[str | None, Array]()
         shifts = np.broadcast_to(shift, tips.shape)
         for side, hand in robot.hands.items():
             palms[side] = np.repeat(robot.palm(q, side)[None], self.postures, axis=0)
-            palms[side][:, :3, 3] += share[:, 0] * shifts[hand[0]]
+            palms[side][:, :3, 3] += fractions[:, 0] * shifts[hand[0]]
         all_fingers = np.ones(len(tips), dtype=bool)
-        path = self._follow(q, tips + share * shifts, palms, all_fingers)
+        path = self._follow(q, tips + fractions * shifts, palms, all_fingers)
         for side, poses in palms.items():
             deviation = np.linalg.norm(robot.palm(path, side)[:, :3, 3] - poses[:, :3, 3], axis=1)
             if deviation.max() > self.max_deviation:
@@ -121,6 +121,7 @@ class ApproachFinder:
             "points": tips,
             "normals": [UNUSED_NORMAL] * f,
             "weights": np.stack([has_contact, 0 * has_contact], axis=1),
+            # The result does not depend on tolerances; the graph requires positive ones.
             "position_tolerance": np.ones(f),
             "angle_tolerance": np.ones(f),
         }
@@ -136,7 +137,7 @@ class ApproachFinder:
 
 
 def hands_used(robot: ArmHand, problem: TargetBatch) -> Array:
-    """Return (f, 1): 1 for all fingers of a hand with a contact, 0 for those of a hand without."""
+    """Return (f, 1): 1 for the fingers of hands with a contact of the grasp, else 0."""
     has_contact, is_used = ~np.isnan(problem.points[0, :, 0]), np.zeros((len(robot.fingers), 1))
     for hand in map(list, robot.hands.values()):
         is_used[hand] = has_contact[hand].any()
@@ -241,10 +242,14 @@ class ApproachRequest:
     pregrasp: Array | None = None
 
     def directions(self, q: Array) -> list[Array]:
-        """Return approach directions (f, 3) to a solution (n,), in the order of preference.
+        """Return approach directions to a solution (n,), in the order of preference.
 
-        The unit vectors are the direction of the plan; or those from the pre-grasp, or else from
-        the palm to the contacts, from above, between both, and tilted to each side.
+        They are the requested direction alone; or else the direction from the pre-grasp (without
+        one, from the palm to the contacts), then between that and vertical, vertical, and tilted to
+        each side.
+
+        Returns:
+            (f, 3) unit vectors of each finger's hand, base frame, per direction.
         """
         robot = self.config.robot
         if self.direction is not None:
@@ -255,8 +260,8 @@ class ApproachRequest:
             fingers = [i for i in hand if has_contact[i]]
             directions = self._hand_directions(robot.palm(q, side), tips[fingers])
             by_finger |= dict.fromkeys(hand, directions)
-        columns = (by_finger[i] for i in sorted(by_finger))
-        return [np.stack(directions) for directions in zip(*columns, strict=True)]
+        in_finger_order = (by_finger[i] for i in sorted(by_finger))
+        return [np.stack(directions) for directions in zip(*in_finger_order, strict=True)]
 
     def _hand_directions(self, palm: Array, tips: Array) -> list[Array]:
         """Return approach directions (3,) of a hand with fingertips (k, 3) in contact."""
@@ -269,9 +274,11 @@ class ApproachRequest:
         first = _unit(first)
         sides = [sign * palm[:3, axis] for axis in (0, 1) for sign in (1.0, -1.0)]
         alternatives = [first + down, down, *(first + TILT * side for side in sides)]
-        lengths = map(np.linalg.norm, alternatives)
-        pairs = zip(alternatives, lengths, strict=True)
-        return [first, *(_unit(vector) if length > 0.1 else first for vector, length in pairs)]
+        # Opposite vectors cancel: such a sum does not define a direction. All hands of a robot have
+        # the same number of directions, so the first one replaces it.
+        are_defined = [np.linalg.norm(vector) > 0.1 for vector in alternatives]
+        pairs = zip(alternatives, are_defined, strict=True)
+        return [first, *(_unit(vector) if is_defined else first for vector, is_defined in pairs)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +287,7 @@ class ApproachAttempt:
 
     Attributes:
         finder: Planner of straight motions.
-        number: Number of the solution, from 1.
+        number: Number of attempted solutions up to this one.
         q: (n,) solution of the grasp.
         path: Approach; None if there is none.
         reason: Reason of a failure, "" on success.
@@ -300,26 +307,29 @@ class ApproachAttempt:
 
 
 def approaches(request: ApproachRequest, solutions: Sequence[Array]) -> Iterator[ApproachAttempt]:
-    """Yield the approaches to solutions (n,) of a grasp, in their order."""
+    """Yield the approaches to solutions (n,) of a grasp, in their order.
+
+    Each attempt varies the opening of the hand and the direction; the reason of a failure is that
+    of the preferred opening and direction.
+    """
     finder = ApproachFinder(request.config)
     closing_query, open_query = _queries(request)
     for number, q in enumerate(solutions, start=1):
-        blocked_opening = -1.0
-        path, reason, coming_query = None, "", open_query
-        for opening, directions in product(
-            request.opening * OPENING_FRACTIONS, request.directions(q)
-        ):
-            if blocked_opening == opening:
-                continue
-            path = finder.find(request.problem, q, opening, request.distance, directions)
-            obstruction, coming_query = _obstruction(request, path, closing_query, open_query)
-            reason = reason or obstruction
-            if not obstruction:
-                reason = ""
+        path, first_reason, coming_query = None, "", open_query
+        all_directions = request.directions(q)
+        for opening in request.opening * OPENING_FRACTIONS:
+            for directions in all_directions:
+                path = finder.find(request.problem, q, opening, request.distance, directions)
+                obstruction = _obstruction(request, path, closing_query, open_query)
+                coming_query = obstruction.coming_query
+                if not obstruction.reason:
+                    break
+                first_reason, path = first_reason or obstruction.reason, None
+                if obstruction.is_closing_blocked:
+                    break  # The closing does not depend on the direction.
+            if path is not None:
                 break
-            path = None
-            if obstruction.startswith(CLOSING_PREFIX):
-                blocked_opening = opening  # for all directions
+        reason = first_reason if path is None else ""
         yield ApproachAttempt(
             finder, number, q, path, reason, open_query, closing_query, coming_query
         )
@@ -364,8 +374,19 @@ def _queries(request: ApproachRequest) -> tuple[CollisionQuery | None, Collision
     return closing_query, check.collision_query(without_contacts).rows(row)
 
 
-CLOSING_PREFIX = "the closing"
-"""Prefix of the reason if the hand cannot close."""
+@dataclass(frozen=True, eq=False)
+class _Obstruction:
+    """Result of checking an approach.
+
+    Attributes:
+        reason: Reason why the approach is not free, "" if it is free.
+        coming_query: Collision checks of the straight motion; None checks nothing.
+        is_closing_blocked: True if the hand collides while it closes.
+    """
+
+    reason: str
+    coming_query: CollisionQuery | None
+    is_closing_blocked: bool = False
 
 
 def _obstruction(
@@ -373,36 +394,36 @@ def _obstruction(
     path: ApproachPath | None,
     closing_query: CollisionQuery | None,
     open_query: CollisionQuery | None,
-) -> tuple[str, CollisionQuery | None]:
-    """Return the obstruction of an approach ("" if free), and the checks of its straight motion.
+) -> _Obstruction:
+    """Check an approach for collisions.
 
     Collision shapes of fingers are larger than the fingers. If a hand cannot open far enough for
     these shapes, links with a contact may touch the object if their pads do not penetrate it.
     """
     if path is None:
-        return "the arm cannot follow the straight retreat", open_query
+        return _Obstruction("the arm cannot follow the straight retreat", open_query)
     if closing_query is None or open_query is None:
-        return "", None
+        return _Obstruction("", None)
     if len(path.closing) > 1 and (contact := minimum_clearance(closing_query, path.closing)[1]):
-        return f"{CLOSING_PREFIX} is not free: {contact}", open_query
+        return _Obstruction(f"the closing is not free: {contact}", open_query, True)
     if len(path.coming) < 2:
-        return "", open_query
+        return _Obstruction("", open_query)
     _, contact = minimum_clearance(open_query, path.coming)
     if not contact:
-        return "", open_query
+        return _Obstruction("", open_query)
     pregrasp_is_free = not minimum_clearance(open_query, path.coming[:1])[1]
     if (
         pregrasp_is_free
         and not minimum_clearance(closing_query, path.coming)[1]
         and _pads_are_free(request, path.coming)
     ):
-        return "", closing_query
-    return f"the approach is not free: {contact}", open_query
+        return _Obstruction("", closing_query)
+    return _Obstruction(f"the approach is not free: {contact}", open_query)
 
 
 def _pads_are_free(request: ApproachRequest, q: Array) -> bool:
     """Return True if the pads do not penetrate the object in postures (k, n)."""
-    check, problem = request.config.check, request.problem
+    check, problem, robot = request.config.check, request.problem, request.config.robot
     assert check is not None
     name = problem.object or check.scene.grasped or ""
     pose = None if problem.object_pose is None else problem.object_pose[0]
@@ -410,11 +431,12 @@ def _pads_are_free(request: ApproachRequest, q: Array) -> bool:
         return False
     object_pose = check.scene.items[name].pose if pose is None else pose
     solid = check.scene.holding(name, object_pose).items[name]
+    # A small sphere at the contact point represents a pad.
     pad = Scene({"pad": {"kind": "sphere", "radius": 1e-4}}).items["pad"]
-    has_contact = ~np.isnan(problem.points[0, :, 0])
+    has_contact, tips = ~np.isnan(problem.points[0, :, 0]), robot.contacts(q)[0]
     poses = np.tile(np.eye(4), (len(q), 1, 1))
     for i in np.flatnonzero(has_contact):
-        poses[:, :3, 3] = request.config.robot.contacts(q)[0][:, i]
+        poses[:, :3, 3] = tips[:, i]
         if gaps(pad, [solid], poses).min() < -MAX_PAD_PENETRATION:
             return False
     return True

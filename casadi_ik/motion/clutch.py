@@ -19,7 +19,7 @@ def rotation_between(a: Array, b: Array) -> Array:
     if cosine < -1 + 1e-12:
         axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
         axis /= np.linalg.norm(axis)
-        return 2.0 * axis[:, None] * axis - np.eye(3)  # half a turn
+        return np.array(2.0 * axis[:, None] * axis - np.eye(3), dtype=float)  # half a turn
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 

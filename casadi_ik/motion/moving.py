@@ -88,17 +88,17 @@ class MovingSolver:
         free_posture = start if posture is None else self._target_builder.start(posture, "posture")
         return Follower(
             FollowerConfig(
-                self._target_builder,
-                self._engine.check,
-                self._engine.compiled,
-                start,
-                self._bounds(None),
-                seconds("period", period),
-                rates,
-                free_posture,
-                seconds("settling", settling),
-                FOLLOWING_PULL,
-                self._nearest,
+                target_builder=self._target_builder,
+                check=self._engine.check,
+                compiled=self._engine.compiled,
+                q0=start,
+                bounds=self._bounds(None),
+                period=seconds("period", period),
+                rates=rates,
+                posture=free_posture,
+                settling=seconds("settling", settling),
+                pull=FOLLOWING_PULL,
+                nearest=self._nearest,
             )
         )
 
@@ -156,7 +156,7 @@ class MovingSolver:
         if targets.fixed is not None and targets.fixed.ndim > 1:
             targets = replace(targets, fixed=self._target_builder.fixed_vector(fixed))
         engine = self._engine.engine_for(targets)
-        _ = engine.finder
+        _ = engine.finder  # raises an error unless the method is hand-first
         ((kinds, _, _),) = group_by_kinds(targets.rows(slice(0, 1)))
         travel = None
         if period is not None:
@@ -304,6 +304,7 @@ class MovingSolver:
         self.robot.description.require_single_hand("place")
         if not self.robot.description.arm_actuators:
             raise UnsupportedError(f"place: {self.robot.name!r} has no arm that moves its palm")
+        # Motion of the object in the base frame, from its pose in the grasp to the target pose.
         motion = target @ inverse(grasp.known_pose)
         q = self._target_builder.start(held.q, "q")
         motors = self.robot.description.finger_motors
@@ -471,25 +472,26 @@ class MovingSolver:
         return solutions, "" if solutions else "the grasp has no solution"
 
     def _path_config(self, q0: Array, targets: TargetBatch | None = None) -> FollowerConfig:
-        """Return the configuration of the graph for paths, without limits of velocities."""
-        bounds, rates = self._bounds(targets), unbounded(self.robot)
-        check, compiled = self._engine.check, self._engine.compiled
+        """Return the configuration of the graph for paths, without limits of velocities.
+
+        With an infinite `settling` there are no free motions, so the period does not matter.
+        """
         return FollowerConfig(
-            self._target_builder,
-            check,
-            compiled,
-            q0,
-            bounds,
-            1.0,
-            rates,
-            q0,
-            math.inf,
-            PATH_PULL,
-            self._nearest,
+            target_builder=self._target_builder,
+            check=self._engine.check,
+            compiled=self._engine.compiled,
+            q0=q0,
+            bounds=self._bounds(targets),
+            period=1.0,
+            rates=unbounded(self.robot),
+            posture=q0,
+            settling=math.inf,
+            pull=PATH_PULL,
+            nearest=self._nearest,
         )
 
     def _nearest(self, target: TargetBatch, q0: Array) -> Array:
-        """Return the configuration (n,) nearest to a target, and the one nearest to q0 of several.
+        """Return the configuration (n,) with the smallest error; of several the nearest to q0.
 
         Args:
             target: One target.
@@ -511,7 +513,10 @@ class MovingSolver:
         )
 
     def _placeholder_target(self, coordinate: float) -> TargetBatch:
-        """Return a target with equal coordinates of all contacts; NaN frees them."""
+        """Return a target whose points have equal coordinates [m]; NaN frees the contacts.
+
+        It serves where a target is required but its contacts do not matter.
+        """
         zeros = np.zeros((1, len(self.robot.fingers), 3))
         target = self._target_builder.from_arrays(zeros, zeros + 1.0)
         return replace(target, points=zeros + coordinate)

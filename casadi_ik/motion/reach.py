@@ -34,13 +34,13 @@ class CarriedObject:
     """Collision checks of a robot and the object in its hand, if the scene knows the object.
 
     Attributes:
-        step: Motion of the palm between two checks of the object [m].
-        motor_step: Norm of the motor motion between two checks of the robot [rad].
+        palm_step: Motion of the palm between two checks of the object [m].
+        motor_step: Norm of the motor motion between two checks of the robot [rad or m].
         slack: Permitted decrease of the object's distance from its support while the hand lifts
             it [m].
     """
 
-    step = 1e-3
+    palm_step = 1e-3
     motor_step = 0.03
     slack = 1e-3
 
@@ -62,11 +62,12 @@ class CarriedObject:
         hands = check.robot.hands
         holding_sides = [side for side, hand in hands.items() if is_used[list(hand)].any()]
         self._side = (holding_sides or list(hands))[0]
-        self._in_palm = None if pose is None else inverse(self._palm(q)) @ pose
+        self._X_palm_object = None if pose is None else inverse(self._palm(q)) @ pose
         if pose is not None:
             self._object = check.scene.holding(self._name, np.eye(4)).items[self._name]
 
     def _palm(self, q: Array) -> Array:
+        """Return the pose (..., 4, 4) of the palm that carries the object."""
         return self._robot.palm(q, self._side)
 
     def path_obstruction(self, q: Array) -> str:
@@ -83,10 +84,11 @@ class CarriedObject:
         return self._object_contact(q, self.slack)
 
     def _query_at(self, q: Array) -> CollisionQuery:
+        """Return the collision checks of the robot at postures (k, n) that carry the object."""
         problems = self._problem.rows(np.zeros(len(q), dtype=np.intp))
-        if self._in_palm is None:
+        if self._X_palm_object is None:
             return self._check.collision_query(problems).rows(np.zeros(1, dtype=np.intp))
-        poses = self._palm(q) @ self._in_palm
+        poses = self._palm(q) @ self._X_palm_object
         carrying = replace(problems, object=self._name, object_pose=poses)
         return self._check.collision_query(carrying, is_carried=True)
 
@@ -100,9 +102,11 @@ class CarriedObject:
             initial: Initial distance from obstacles [m]; None: that of the first posture.
         """
         scene = self._check.scene
-        if self._in_palm is None:
+        if self._X_palm_object is None:
             return ""
-        poses = self._palm(_resampled(q, self._palm(q)[:, :3, 3], self.step)) @ self._in_palm
+        poses = (
+            self._palm(_resampled(q, self._palm(q)[:, :3, 3], self.palm_step)) @ self._X_palm_object
+        )
         allowed = {frozenset(contact.links) for contact in scene.touching}
         for name, item in scene.items.items():
             pair = frozenset((name, self._name))
@@ -229,12 +233,12 @@ class _Stage:
     Attributes:
         segments: Segments in their order.
         query: Collision checks; None checks nothing.
-        counts: True if the clearance of the segments is part of `Reach.clearance`.
+        limits_clearance: True if the clearance of the segments is part of `Reach.clearance`.
     """
 
     segments: Sequence[Segment]
     query: CollisionQuery | CarriedObject | None
-    counts: bool = True
+    limits_clearance: bool = True
 
 
 def reach(
@@ -257,10 +261,11 @@ def reach(
             return failed(ReachStatus.NO_APPROACH, attempt.reason)
         carried_object = None if check is None else CarriedObject(check, problem, attempt.q)
         (first_tips, last_tips), _ = robot.contacts(path.coming[[0, -1]])
-        back = first_tips - last_tips
-        back /= np.maximum(np.linalg.norm(back, axis=1, keepdims=True), 1e-9)
+        reverse_approach = first_tips - last_tips
+        lengths = np.linalg.norm(reverse_approach, axis=1, keepdims=True)
+        reverse_approach /= np.maximum(lengths, 1e-9)
         q, is_used, segments = attempt.q, hands_used(robot, problem), list[Segment]()
-        for name, shift in ((LIFTING, lift * UP), (RETREATING, retreat * back)):
+        for name, shift in ((LIFTING, lift * UP), (RETREATING, retreat * reverse_approach)):
             if not shift.any():
                 continue
             postures = attempt.finder.straight(q, shift * is_used)
@@ -275,8 +280,8 @@ def reach(
         stages = (
             _Stage(transfer, attempt.open_query),
             _Stage([(APPROACH, path.coming)], attempt.coming_query),
-            _Stage([(CLOSING, path.closing)], attempt.closing_query, counts=False),
-            _Stage(segments, carried_object, counts=False),
+            _Stage([(CLOSING, path.closing)], attempt.closing_query, limits_clearance=False),
+            _Stage(segments, carried_object, limits_clearance=False),
         )
         return _timed_motion(robot, stages, request.pace, note, attempt.q, attempt.number)
 
@@ -313,8 +318,12 @@ def place(
             return failed(ReachStatus.NO_APPROACH, f"the path down is not free: {obstruction}")
         carrying, note = _plan_segments(request, CARRYING, down[0], carried_object)
         stages = (
-            _Stage([*carrying, (LOWERING, down)] if carrying else [], carried_object, counts=False),
-            _Stage([(OPENING, path.closing[::-1])], attempt.closing_query, counts=False),
+            _Stage(
+                [*carrying, (LOWERING, down)] if carrying else [],
+                carried_object,
+                limits_clearance=False,
+            ),
+            _Stage([(OPENING, path.closing[::-1])], attempt.closing_query, limits_clearance=False),
             _Stage([(LEAVING, path.coming[::-1])], attempt.coming_query),
         )
         return _timed_motion(request.robot, stages, request.pace, note, attempt.q, attempt.number)
@@ -411,10 +420,8 @@ def _timed_motion(
             reason = stage.query.path_obstruction(postures)
         elif stage.query is not None:
             stage_clearance, reason = minimum_clearance(stage.query, postures)
-            if stage.counts:
-                clearance = (
-                    stage_clearance if clearance is None else min(clearance, stage_clearance)
-                )
+            if stage.limits_clearance:
+                clearance = min(stage_clearance, np.inf if clearance is None else clearance)
         if reason:
             return failed(ReachStatus.NO_WAY, f"the timed motion is not free: {reason}")
     limit_fractions = limit_fraction(motion.q, pace.period, pace.rates)
