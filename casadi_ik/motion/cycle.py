@@ -123,11 +123,11 @@ def step_bounds(s: dict[str, Expr], p: dict[str, Expr]) -> tuple[Expr, Expr]:
     low = ca.fmax(low, -brake(ca.fmax(s["q"] - p["lower"], 0.0), max_change))
     high = ca.fmin(max_step, s["last_step"] + max_change)
     high = ca.fmin(high, brake(ca.fmax(p["upper"] - s["q"], 0.0), max_change))
-    # With rounding errors the lower bound may exceed the upper one slightly.
+    # Rounding errors may lead the lower bound slightly beyond the upper one.
     return ca.fmin(low, high), high
 
 
-def share_within(start: Expr, end: Expr, low: Expr, high: Expr) -> Expr:
+def last_within(start: Expr, end: Expr, low: Expr, high: Expr) -> Expr:
     """Return the farthest posture (n, 1) within bounds on the line from one posture to another.
 
     Args:
@@ -138,9 +138,10 @@ def share_within(start: Expr, end: Expr, low: Expr, high: Expr) -> Expr:
     """
     line = end - start
     available = ca.if_else(line > 0, high - start, start - low)
+    # 1e-15: motors that do not move do not limit the fraction.
     length = ca.fmax(ca.fabs(line), 1e-15)
-    share = ca.fmin(1.0, ca.mmin((available + 1e-15) / length))
-    return ca.fmin(ca.fmax(start + share * line, low), high)
+    fraction = ca.fmin(1.0, ca.mmin((available + 1e-15) / length))
+    return ca.fmin(ca.fmax(start + fraction * line, low), high)
 
 
 def track_goal(s: dict[str, Expr], goal: Expr, goal_step: Expr, p: dict[str, Expr]) -> Expr:
@@ -149,7 +150,7 @@ def track_goal(s: dict[str, Expr], goal: Expr, goal_step: Expr, p: dict[str, Exp
     Args:
         s: State with "q" and "last_step".
         goal: (n, 1) goal.
-        goal_step: (n, 1) motion of the goal that is expected to continue.
+        goal_step: (n, 1) motion of the goal in this cycle, which is expected to continue.
         p: Parameters with "lower", "upper", "max_step" and "max_change".
     """
     distance = goal - s["q"] - goal_step
@@ -285,7 +286,7 @@ class Cycle:
 
     @property
     def graph(self) -> FunctionGraph:
-        """``(state, parameters) -> (state', record)``."""
+        """Graph ``(state, parameters) -> (state', record)``, built when it is needed."""
         variant = f"cycle_{self.obstacles}" if self.obstacles else "cycle"
         name = ca.Function.fix_name(f"{self.robot.name}_{variant}{kinds_suffix(self.kinds)}")
         inputs = {"state": (self.state.size, 1), "parameters": (self.parameters.size, 1)}
@@ -294,13 +295,14 @@ class Cycle:
         return FunctionGraph(name, lambda: self._build(name), inputs, outputs, graph_recipe)
 
     def _build(self, name: str) -> ca.Function:
+        """Return the function of the graph: bounds and anchor, Gauss-Newton steps, new state."""
         begin, step, end = self._begin(), self._step(avoids=False), self._end()
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
         first, low, high, *anchor_and_error = begin(state, parameters)
         goal, condition = first, list[ca.MX]()
         if self.obstacles:
-            # A step without clearances is faster by a fifth.
+            # A step without clearances is faster by a fifth, so it is used where none is lacking.
             step = ca.Function.if_else("choose", self._step(avoids=True), step)
             condition = [ca.mmax(parameters[self.parameters.slice("lacking")]) > 0]
         origin = state[self.state.slice("goal")]
@@ -320,16 +322,24 @@ class Cycle:
         return p | {"normals": p["normals"] / ca.repmat(lengths, 1, 3)}
 
     def _begin(self) -> ca.Function:
-        """Return ``(state, parameters) -> (first, low, high, anchor, error)`` of the goal."""
+        """Return ``(state, parameters) -> (first, low, high, anchor, error)`` of the goal.
+
+        `first` is the goal at which the Gauss-Newton steps start, `low` and `high` are its bounds
+        in this cycle; anchor and error are those of the least squares, see the module.
+        """
         state, parameters = self.state.symbols("state"), self.parameters.symbols("parameters")
         s, p = self.state.unpack(state), self.parameters.unpack(parameters)
         locked_on = s["locked_on"] > 0.5
         low, high = step_bounds(s, p)
-        longest = ca.fmin(p["max_step"], CYCLE_TUNING.max_goal_step * motor_scales(self.robot))
+        max_goal_step = CYCLE_TUNING.max_goal_step * motor_scales(self.robot)
+        longest = ca.fmin(p["max_step"], max_goal_step)
         # Rounding errors of motors that stop at a limit must not exceed it: clip both.
         low, high = (
-            ca.fmin(ca.fmax(s["goal"] + ca.if_else(locked_on, step, leap), p["lower"]), p["upper"])
-            for step, leap in ((low, -longest), (high, longest))
+            ca.fmin(
+                ca.fmax(s["goal"] + ca.if_else(locked_on, motor_step, goal_step), p["lower"]),
+                p["upper"],
+            )
+            for motor_step, goal_step in ((low, -longest), (high, longest))
         )
         continued = ca.if_else(locked_on, s["last_step"], 0.0)
         first = ca.fmin(ca.fmax(s["goal"] + continued, low), high)
@@ -341,7 +351,7 @@ class Cycle:
         return ca.Function("begin", [state, parameters], outputs)
 
     def _unused_tolerance(self, residual: Expr, p: dict[str, Expr]) -> Expr:
-        """Return the tolerance minus the residual; 0 if the residual exceeds the tolerance."""
+        """Return the fraction of the tolerance that the residual of the contacts leaves, >= 0."""
         tolerance = ca.fmin(
             ca.mmin(p["position_tolerance"]) / LENGTH, ca.mmin(p["angle_tolerance"])
         )
@@ -356,7 +366,8 @@ class Cycle:
         """
         names = "origin", "goal", "low", "high", "anchor"
         origin, goal, low, high, anchor = self._symbols(*names)
-        error = ca.SX.sym("error", self.state.size - 3 * goal.numel() - 1)
+        residual = self.state.slice("residual")
+        error = ca.SX.sym("error", residual.stop - residual.start)
         parameters = self.parameters.symbols("parameters")
         p = self._unpacked(parameters)
         new_goal = self._goal(goal, (low, high), anchor, error, p, origin if avoids else None)
@@ -372,8 +383,8 @@ class Cycle:
         s, p = self.state.unpack(state), self._unpacked(parameters)
         locked_on = s["locked_on"] > 0.5
         first, solution, low, high = self._symbols("first", "solution", "low", "high")
-        goal = share_within(first, solution, low, high)
-        # Without this, rounding errors would move the motors indefinitely.
+        goal = last_within(first, solution, low, high)
+        # Without a threshold, rounding errors would move the motors indefinitely.
         threshold = ca.fmin(
             CYCLE_TUNING.min_change * p["max_change"], CYCLE_TUNING.arrival_distance
         )

@@ -22,13 +22,13 @@ from casadi_ik.solve.verdict import judge
 
 
 def contacts_between(targets: TargetBatch, i: int, count: int) -> TargetBatch:
-    """Return `count` contacts from grasp i - 1 (exclusive) to grasp i (inclusive)."""
-    share = np.linspace(0, 1, count + 1)[1:, None, None]
+    """Return `count` interpolated targets from grasp i - 1 (exclusive) to grasp i (inclusive)."""
+    fractions = np.linspace(0, 1, count + 1)[1:, None, None]
 
     def interpolate(values: Array) -> Array:
         # Contacts that are free in the previous grasp stay at their value in this one.
         previous = np.where(np.isnan(values[i - 1]), values[i], values[i - 1])
-        return (1 - share) * previous + share * values[i]
+        return (1 - fractions) * previous + fractions * values[i]
 
     def interpolate_directions(values: Array) -> Array:
         vectors = interpolate(values)
@@ -37,7 +37,7 @@ def contacts_between(targets: TargetBatch, i: int, count: int) -> TargetBatch:
     normals, extra_vectors = interpolate_directions(targets.normals), {}
     for name, values in targets.extra_vectors.items():
         vectors = interpolate_directions(values)
-        if name == "tangents":
+        if name == "tangents":  # perpendicular to the interpolated normals
             vectors -= normals * np.sum(normals * vectors, axis=2, keepdims=True)
             vectors /= np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), 1e-12)
         extra_vectors[name] = vectors
@@ -51,13 +51,14 @@ class TrackTuning:
     """Parameters of tracking a known path. Source: ``studies/moving.py``.
 
     Attributes:
-        cycles: Number of cycles per grasp. Source: grasps of a path may be farther apart than
-            targets of a stream.
-        leap: Motion of a motor from one grasp to the next, relative to its range, above which the
-            contacts are interpolated.
-        substeps: Number of interpolation steps.
-        settling: Maximum number of cycles before a grasp counts as missed.
-        block: Number of grasps that are tracked at once; results after a missed grasp are
+        cycles: Number of cycles per grasp; more than one, because grasps of a path may be farther
+            apart than targets of a stream.
+        leap: Motion of a motor from one grasp to the next, relative to its range, above which it
+            counts as a leap and the contacts are interpolated.
+        substeps: Number of interpolation steps from one grasp to the next.
+        max_settling_grasps: How often a grasp is repeated, with `cycles` cycles each time, before
+            it counts as missed.
+        block: Number of grasps that are tracked in one call; results after a failure are
             discarded.
         starts: Maximum number of attempted solutions of the first grasp.
     """
@@ -65,7 +66,7 @@ class TrackTuning:
     cycles: int = 2
     leap: float = 0.05
     substeps: int = 16
-    settling: int = 8
+    max_settling_grasps: int = 8
     block: int = 512
     starts: int = 8
 
@@ -78,6 +79,7 @@ class PathTracker:
 
     Attributes:
         n: Number of motors.
+        fields: Positions of the fields of a state.
     """
 
     def __init__(self, config: FollowerConfig, kinds: Kinds) -> None:
@@ -85,29 +87,29 @@ class PathTracker:
         self._guard = None if config.check is None else Guard(config)
         self._runner = CycleRunner(config, kinds, 0 if self._guard is None else OBSTACLES)
         self.n = len(config.robot.actuators)
+        self.fields = self._runner.fields
 
     def state_at(self, q: Array) -> Array:
         """Return the state of rest at a posture (n,)."""
         return self._runner.state_at(q)
 
-    def walk(self, state: Array, targets: TargetBatch) -> Array:
-        """Track targets, `TrackTuning.cycles` cycles each.
+    def track(self, state: Array, targets: TargetBatch) -> Array:
+        """Track targets in their order, `TrackTuning.cycles` cycles each.
 
         Args:
             state: Initial state.
             targets: k targets.
 
         Returns:
-            (k, ...) states after each target (`Cycle.state`); they begin with the positions of the
-            motors, their last step, and the goal.
+            (k, s) states after each target (`Cycle.state`).
         """
         runner, guard = self._runner, self._guard
         values = contact_rows(runner.cycle, targets) | tolerance_rows(targets.tolerances)
         rows = runner.rows(len(targets), values)
         if guard is None:
-            return runner.recurrence.run(state, np.repeat(rows, TRACK_TUNING.cycles, axis=0))[0][
-                TRACK_TUNING.cycles - 1 :: TRACK_TUNING.cycles
-            ]
+            cycles = TRACK_TUNING.cycles
+            all_states, _ = runner.recurrence.run(state, np.repeat(rows, cycles, axis=0))
+            return all_states[cycles - 1 :: cycles]
         runner.recurrence.state[:] = state
         states = np.empty((len(rows), len(state)))
         for i, row in enumerate(rows):
@@ -145,7 +147,7 @@ class Jump:
 
 @dataclass(eq=False)
 class Path:
-    """Path of grasps that is tracked.
+    """Tracking of a path of grasps.
 
     Attributes:
         engine: Engine of the hand-first method.
@@ -167,7 +169,7 @@ class Path:
 
     def follow(self, start: Array) -> tuple[Array, list[Jump]]:
         """Return configurations (k, n) that begin with `start`, and the jumps between them."""
-        count, n = len(self.targets), self.tracker.n
+        count, fields = len(self.targets), self.tracker.fields
         first = self.tracker.state_at(start)
         states = np.empty((count, len(first)))
         states[0] = first
@@ -175,8 +177,8 @@ class Path:
         i = 1
         while i < count:
             block = self.targets.rows(slice(i, min(i + TRACK_TUNING.block, count)))
-            states[i : i + len(block)] = self.tracker.walk(states[i - 1], block)
-            failure = self._first_failure(i, states[i - 1 : i + len(block), 2 * n : 3 * n])
+            states[i : i + len(block)] = self.tracker.track(states[i - 1], block)
+            failure = self._first_failure(i, states[i - 1 : i + len(block), fields.goal])
             if failure is None:
                 i += len(block)
                 continue
@@ -184,7 +186,7 @@ class Path:
             states[i], jump = self._resume(i, states[i - 1], states[i])
             jumps += [jump] if jump else []
             i += 1
-        return states[:, :n], jumps
+        return states[:, fields.q], jumps
 
     def _first_failure(self, first: int, goals: Array) -> int | None:
         """Return the first grasp of a block whose goal leaps, or misses a grasp with a solution.
@@ -192,13 +194,17 @@ class Path:
         Args:
             first: Number of the block's first grasp.
             goals: (m + 1, n) goal before the block, and the goals of its grasps.
+
+        Returns:
+            Number within the block; None without a failure.
         """
         rows = np.arange(first, first + len(goals) - 1)
         leaps = self._relative_motion(np.diff(goals, axis=0)) > TRACK_TUNING.leap
-        missed = ~self.meets(rows, goals[1:])
-        candidates = missed & ~leaps
-        missed[candidates] = self._have_solutions(rows[candidates])
-        failures = np.flatnonzero(leaps | missed)
+        is_failure = leaps | ~self.meets(rows, goals[1:])
+        # A grasp without a solution is no reason to interpolate.
+        only_missed = is_failure & ~leaps
+        is_failure[only_missed] = self._have_solutions(rows[only_missed])
+        failures = np.flatnonzero(is_failure)
         return int(failures[0]) if len(failures) else None
 
     def _have_solutions(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -213,28 +219,38 @@ class Path:
     def _resume(
         self, i: int, previous_state: Array, direct_state: Array
     ) -> tuple[Array, Jump | None]:
-        """Return the state at a grasp that a block could not continue to, and a jump if needed."""
-        n, row, leap = self.tracker.n, self._row(i), TRACK_TUNING.leap
-        previous_goal, rows = previous_state[2 * n : 3 * n], np.array([i])
-        repeated = row.rows(np.zeros(TRACK_TUNING.settling, dtype=np.intp))
-        goal, last_goal = self.tracker.walk(previous_state, repeated)[-1][2 * n : 3 * n], None
+        """Return the state at a grasp that a block could not continue to, and a jump if needed.
+
+        The contacts of the grasp are tracked for more cycles, then approached in small steps, and
+        last of all the nearest solution on any branch is taken.
+
+        Args:
+            i: Number of the grasp.
+            previous_state: State at the grasp before.
+            direct_state: State of the block at this grasp, which remains if there is no solution.
+        """
+        target, leap, goal_field = self._row(i), TRACK_TUNING.leap, self.tracker.fields.goal
+        previous_goal, rows = previous_state[goal_field], np.array([i])
+        repeated = target.rows(np.zeros(TRACK_TUNING.max_settling_grasps, dtype=np.intp))
+        goal = self.tracker.track(previous_state, repeated)[-1][goal_field]
+        goal_before_leap = None
         is_met = self.meets(rows, goal[None])[0]
         if not is_met or self._relative_motion(goal - previous_goal) > leap:
-            goal, last_goal = self._move_in_small_steps(i, previous_state)
-            if last_goal is not None or not self.meets(rows, goal[None])[0]:
+            goal, goal_before_leap = self._move_in_small_steps(i, previous_state)
+            if goal_before_leap is not None or not self.meets(rows, goal[None])[0]:
                 if not self._have_solutions(rows)[0]:
                     return direct_state, None
                 alternatives = self.engine.finder.find(
-                    row.starting_at(previous_goal), 1, "q0", query=self._query_at(rows)
+                    target.starting_at(previous_goal), 1, "q0", query=self._query_at(rows)
                 )
                 if not alternatives:
                     return direct_state, None
-                last_goal = goal if last_goal is None else last_goal
+                goal_before_leap = goal if goal_before_leap is None else goal_before_leap
                 goal = alternatives[0].q
         state = self.tracker.state_at(goal)
-        if last_goal is None or self._relative_motion(goal - previous_goal) <= leap:
+        if goal_before_leap is None or self._relative_motion(goal - previous_goal) <= leap:
             return state, None
-        return state, self._jump(i, previous_goal, goal, last_goal)
+        return state, self._jump(i, previous_goal, goal, goal_before_leap)
 
     def _move_in_small_steps(self, i: int, previous_state: Array) -> tuple[Array, Array | None]:
         """Move the contacts from the previous grasp to this one in small steps.
@@ -242,10 +258,9 @@ class Path:
         Returns:
             Final goal, and the goal before the first leap of a motor, None without a leap.
         """
-        n = self.tracker.n
         substeps = contacts_between(self.targets, i, TRACK_TUNING.substeps)
-        states = self.tracker.walk(previous_state, substeps)
-        goals = np.concatenate([previous_state[None, 2 * n : 3 * n], states[:, 2 * n : 3 * n]])
+        states = self.tracker.track(previous_state, substeps)
+        goals = np.concatenate([previous_state[None], states])[:, self.tracker.fields.goal]
         leaps = np.flatnonzero(self._relative_motion(np.diff(goals, axis=0)) > TRACK_TUNING.leap)
         return goals[-1], goals[leaps[0]] if len(leaps) else None
 
@@ -282,12 +297,13 @@ class Path:
         robot = self.engine.robot
         return np.max(np.abs(change) / (robot.upper - robot.lower), axis=-1)
 
-    def _jump(self, i: int, start: Array, end: Array, last_goal: Array) -> Jump:
+    def _jump(self, i: int, start: Array, end: Array, goal_before_leap: Array) -> Jump:
+        """Return the jump at a grasp, between two goals (n,)."""
         robot = self.engine.robot
         change = end - start
         largest = int(np.argmax(np.abs(change) / (robot.upper - robot.lower)))
         lower, upper = robot.description.motion_limits
-        is_at_limit = (last_goal - lower <= 1e-6) | (upper - last_goal <= 1e-6)
+        is_at_limit = np.minimum(goal_before_leap - lower, upper - goal_before_leap) <= 1e-6
         names = tuple(np.array(robot.actuators)[is_at_limit].tolist())
         return Jump(i, robot.actuators[largest], float(change[largest]), names)
 
@@ -358,7 +374,7 @@ def track(
         q, jumps = path.follow(start)
         missed = int((~path.meets(all_rows, q)).sum())
         if query is not None and not missed:
-            # A segment with a collision counts as one missed grasp.
+            # A segment with a collision counts as one missed grasp. Jumps are never free.
             missed += int((~_free_between(query, q, jumps)).sum()) - len(jumps)
         if (missed, len(jumps)) < best_counts:
             best, best_counts = (q, jumps), (missed, len(jumps))
@@ -382,7 +398,10 @@ def track(
 
 
 def _free_between(query: CollisionQuery, q: Array, jumps: Sequence[Jump]) -> Bools:
-    """Return (k - 1,) True for free segments between postures (k, n), False for jumps."""
+    """Return (k - 1,) True for free segments between postures (k, n), False for jumps.
+
+    The motion is checked from jump to jump.
+    """
     jump_rows = np.array([jump.index for jump in jumps], dtype=np.intp)
     free = np.ones(max(len(q) - 1, 0), dtype=bool)
     free[jump_rows - 1] = False
