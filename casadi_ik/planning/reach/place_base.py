@@ -425,12 +425,15 @@ class _PlacementSearch:
             batch = [queue.pop() for _ in range(min(PLACEMENT_PARAMETERS.batch, len(queue)))]
             batch = [box for box in batch if box[0] > self.best_count]
             boxes = self._bounded(batch)
-            if boxes:
-                # A base takes ten times as long as the bound of a box.
-                _, lower, upper, palms = max(boxes, key=lambda box: box[0])
-                base, count = self.evaluate((lower + upper) / 2, palms)
+            # A base takes ten times as long as the bound of a box, so that only one is evaluated.
+            for _, lower, upper, palms in sorted(boxes, key=lambda box: -box[0]):
+                middle = (lower + upper) / 2
+                if not self._score.stands_free(middle):
+                    continue
+                base, count = self.evaluate(middle, palms)
                 if count > self.best_count and self._score.stands_free(base):
                     self.best, self.best_count = base, count
+                break
             for bound, lower, upper, palms in boxes:
                 if bound <= self.best_count:
                     continue
