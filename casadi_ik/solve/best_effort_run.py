@@ -32,7 +32,9 @@ target is out of reach. It does not exceed 1 for a solution; the excess covers r
 Source: of 220,000 reachable targets, many at limits, of a Panda, a KUKA LWR with a Barrett hand and
 a Panda with an Allegro hand, with tolerances of 0.5 mm and 1.5 mm, one restart leaves 1,848
 unsolved, and the mean square of 29 of these exceeds 1. Two restarts leave 14, and none exceeds 1.
-Of 90,000 reachable targets of an SO-101, one restart leaves 98, and none exceeds 1.
+Of 90,000 reachable targets of an SO-101, one restart leaves 98, and none exceeds 1. Of 139,975
+targets at limits that five robots solve at tolerances of 0.25 mm to 1 mm, all have the same
+solutions with best effort.
 """
 
 FIRST_RESTARTS, FIRST_RESTARTS_WITHOUT_CLOSED_FORM = 2, 1
