@@ -13,7 +13,6 @@ import peers
 import pytest
 
 import casadi_ik as ik
-from casadi_ik.errors import InputError
 
 ROOT = Path(ik.__file__).parents[1]
 CASES = (
@@ -58,7 +57,7 @@ def test_another_checkout_needs_the_public_names_alone(tmp_path):
     package = tmp_path / "casadi_ik"
     package.mkdir()
     (package / "__init__.py").touch()
-    with pytest.raises(InputError, match=bench.OLDEST):
+    with pytest.raises(ik.errors.InputError, match=bench.OLDEST):
         bench.main(["--part", "fast", "--robots", "ar10", "--against", str(tmp_path)])
 
 

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from processes import python
+from commands import main
 
 import casadi_ik as ik
-from casadi_ik import logs
-from casadi_ik.app import pictures as views
 
 
 class Page(HTMLParser):
@@ -49,8 +47,15 @@ def study(robot: ik.ArmHand, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_page(study: Path) -> None:
-    text = views.study_page(logs.open(study), "<script>alert(1)</script>", 24)
+def report(study: Path, out: Path, *options: str) -> str:
+    """Return the text of the page that the command writes."""
+    assert main(["log", "report", str(study), "--out", str(out), *options]) == 0
+    return out.read_text(encoding="utf-8")
+
+
+def test_page(study: Path, tmp_path: Path) -> None:
+    title = "<script>alert(1)</script>"
+    text = report(study, tmp_path / "study.html", "--title", title, "--most", "24")
     assert "24 solves" in text
     page = Page(text)
     assert page.tags.count("script") == 1
@@ -69,8 +74,8 @@ def test_page(study: Path) -> None:
     assert sum(int(row[0]) for row in page.cells if len(row) == 4) == 12
 
 
-def test_most(study: Path) -> None:
-    text = views.study_page(logs.open(study), "a study", 5)
+def test_most(study: Path, tmp_path: Path) -> None:
+    text = report(study, tmp_path / "study.html", "--most", "5")
     assert text.count('<tbody class="solve"') == 5
     assert "The 5 hardest solves" in text
 
@@ -79,12 +84,19 @@ def test_most(study: Path) -> None:
     ("words", "says"),
     [
         (["nowhere.mcap", "--out", "a.html"], "nowhere.mcap"),
-        (["STUDY", "--out", "a.txt"], "expected a name ending in .html"),
+        (["STUDY", "--out", "a.txt"], ".html"),
     ],
 )
-def test_refusals(words: list[str], says: str, study: Path, tmp_path: Path) -> None:
+def test_refusals(
+    words: list[str],
+    says: str,
+    study: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
     named = [str(study) if word == "STUDY" else word for word in words]
-    done = python("-m", "casadi_ik", "log", "report", *named, cwd=tmp_path)
-    assert done.returncode == 2
-    assert says in done.stderr
+    assert main(["log", "report", *named]) == 2
+    assert says in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
