@@ -22,11 +22,11 @@ from casadi_ik.kinematics.arms.srs import SrsArm
 from casadi_ik.kinematics.contacts import LENGTH
 from casadi_ik.model.targets import TargetBatch
 from casadi_ik.solve.diagnosis import ArmReach, HandFit
-from casadi_ik.solve.hand_first.rows import fit_hands_again
 from casadi_ik.solve.row_selection import smallest_per_owner
 from casadi_ik.solve.subproblems import (
     UNREACHABLE_TOLERANCE,
     SubproblemSolver,
+    fit_hands_again,
     residual_tolerances,
 )
 from casadi_ik.solve.verdict import contact_verdicts, judge
