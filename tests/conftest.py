@@ -151,5 +151,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _has_opengl() -> bool:
     """Return whether OpenGL works, tested in another process because VTK may abort it."""
-    program = "from casadi_ik.app.pictures.scene3d import Stage; Stage().close()"
-    return subprocess.run([sys.executable, "-c", program], capture_output=True).returncode == 0
+    program = "from casadi_ik.app.pictures.scene3d import Scene3D; Scene3D().close()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert "cannot import name" not in done.stderr, done.stderr
+    return done.returncode == 0

@@ -159,17 +159,24 @@ def test_headless_pictures_say_nothing_and_leave_pyplot_alone() -> None:
     assert done.stdout + done.stderr == ""
 
 
-@pytest.mark.parametrize("missing", ["matplotlib", "pyvista"])
-def test_without_the_extra_the_error_says_what_to_install(missing: str) -> None:
+@pytest.mark.parametrize(
+    ("module", "extra", "missing"),
+    [("pictures", "plots", "matplotlib"), ("pictures", "plots", "pyvista"),
+     ("viewer", "view", "viser")],
+)  # fmt: skip
+def test_without_the_extra_the_error_says_what_to_install(
+    module: str, extra: str, missing: str
+) -> None:
     code = (
-        f"import sys; sys.modules['{missing}'] = None\n"
+        f"import sys; sys.modules['{missing}'] = sys.modules['trimesh'] = None\n"
         "import casadi_ik\n"
-        "try: import casadi_ik.app.pictures\n"
+        f"try: import casadi_ik.app.{module}\n"
         "except casadi_ik.CasadiIKError as error: print(type(error).__name__, error)"
     )
     done = python("-c", code, check=True)
-    assert done.stdout.startswith(f"MissingExtraError pictures: {missing} ")
-    assert "pip install 'casadi-ik[plots]'" in done.stdout
+    assert done.stdout.startswith("MissingExtraError ")
+    assert f"{missing} " in done.stdout
+    assert f"pip install 'casadi-ik[{extra}]'" in done.stdout
     assert done.stdout.count("\n") == 1
 
 

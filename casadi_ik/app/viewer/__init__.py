@@ -9,19 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from casadi_ik.app.drawing.surfaces import join_surfaces
-from casadi_ik.app.drawing.visual_meshes import file_mesh_parts
-from casadi_ik.collision.scene import Scene
 from casadi_ik.errors import DescriptionError, InputError, optional_import
-from casadi_ik.files.reading import read_yaml
-from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
-from casadi_ik.logs.solve import SolveRecord
-from casadi_ik.model.grasp import Grasp
-from casadi_ik.planning.touch.found_grasps import FoundGrasp
 
+# The first missing package decides which extra the error names.
 with optional_import("the viewer"):
     import viser as _  # noqa: F401
 
+from casadi_ik.app.drawing.surfaces import join_surfaces
+from casadi_ik.app.drawing.visual_meshes import file_mesh_parts
 from casadi_ik.app.viewer.access import HOST, LOOPBACK, PORT, Server, Viewer, serve
 from casadi_ik.app.viewer.candidates import Candidate, Candidates
 from casadi_ik.app.viewer.grasp_page import GraspPage
@@ -29,6 +24,12 @@ from casadi_ik.app.viewer.pad_page import PadPage
 from casadi_ik.app.viewer.page import Page
 from casadi_ik.app.viewer.play_page import PlayPage, motion_playback, solve_playback
 from casadi_ik.app.viewer.request import PageRequest, Settings, request_of
+from casadi_ik.collision.scene import Scene
+from casadi_ik.files.reading import read_yaml
+from casadi_ik.kinematics.arm_hand import ArmHand, load_robot
+from casadi_ik.logs.solve import SolveRecord
+from casadi_ik.model.grasp import Grasp
+from casadi_ik.planning.touch.found_grasps import FoundGrasp
 
 __all__ = [
     "HOST",
