@@ -74,6 +74,7 @@ def in_single_precision(text: str) -> str:
 
 
 def _exchanged(match: re.Match[str]) -> str:
+    """Return a number, type or function of C in single precision."""
     number, word = match["number"], match["word"]
     if number is not None:
         return _number(number)

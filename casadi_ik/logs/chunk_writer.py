@@ -299,6 +299,7 @@ class ChunkWriter:
         return data, runs
 
     def _write_chunk(self, data: np.ndarray, runs: list[MessageRun]) -> None:
+        """Write a chunk, after the head of the file if it is the first one."""
         head = b"" if self._file.position else self._head
         position = self._file.position + len(head)
         chunk, index = pack_chunk(data.data, runs, self._compression, position)

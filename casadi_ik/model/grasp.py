@@ -511,6 +511,7 @@ class Grasp:
 
 
 def _frozen_palms(palm: Any) -> Array | Mapping[str, Array]:
+    """Return a palm pose, or the palm poses by side, as read-only arrays."""
     if not isinstance(palm, Mapping):
         return read_only(single_pose(palm, "palm").copy())
     if not palm:
@@ -521,6 +522,7 @@ def _frozen_palms(palm: Any) -> Array | Mapping[str, Array]:
 
 
 def _unit(value: Any, name: str) -> Array:
+    """Return a vector of three numbers as a unit vector."""
     vector = _vector(value, name)
     x, y, z = vector.tolist()
     length = math.sqrt(x * x + y * y + z * z)
@@ -534,6 +536,7 @@ def _unit(value: Any, name: str) -> Array:
 
 
 def _vector(value: Any, name: str) -> Array:
+    """Return three numbers as a read-only array."""
     try:
         array = real_array(value)
     except (TypeError, ValueError) as error:

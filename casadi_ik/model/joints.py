@@ -363,6 +363,12 @@ def _driven_joints(motor: str, joints: Sequence[Joint]) -> list[Follower]:
 def _position_map(
     joint: Joint, maps: dict[str, Callable[[Array], Array]]
 ) -> Callable[[Array], Array]:
+    """Return the function from motor positions to positions of a joint.
+
+    Args:
+        joint: The joint.
+        maps: Functions of the joints or motors that it may follow, by name.
+    """
     coupling = joint.coupling
     if coupling is None:
         return maps[joint.name]

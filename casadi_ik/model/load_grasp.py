@@ -258,6 +258,7 @@ def load_grasp_files(path: Path) -> tuple[Grasp, ...]:
 
 
 def _load_file(path: Path) -> tuple[Grasp, ...]:
+    """Return the grasp of a file, or all candidates of a file of candidates."""
     raw = parse_yaml(path)
     if not (isinstance(raw, dict) and "candidates" in raw):
         return (load_grasp(path),)

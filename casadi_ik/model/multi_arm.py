@@ -239,6 +239,7 @@ def _trunk_link(
 
 
 def _check_sides(name: str, sides: Collection[str], path: Path) -> None:
+    """Check the number and the names of the sides."""
     require_usable_name(name, f"{path}: name")
     if not sides:
         raise DescriptionError(f"{path}: sides: is empty; expected at least one side")

@@ -155,6 +155,7 @@ def _split_mesh_name(name: str) -> tuple[list[str], str, str]:
 
 
 def _object_from_mesh(name: str) -> GraspObject:
+    """Return the object of mesh files with a scale, written as `load_object` accepts them."""
     files, _, factor = _split_mesh_name(name)
     try:
         scale = float(factor)

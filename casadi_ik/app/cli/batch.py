@@ -374,12 +374,14 @@ class _GrowingFile:
             (self._parquet if is_parquet else self._npz)(arrays, part)
 
     def _npz(self, arrays: Mapping[str, np.ndarray], part: Path) -> None:
+        """Write results by name as an npz file."""
         with zipfile.ZipFile(part, "w") as archive:
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, array, allow_pickle=False)
 
     def _parquet(self, arrays: Mapping[str, np.ndarray], part: Path) -> None:
+        """Write results as a Parquet file with a column for each motor and finger."""
         motors, fingers = self._robot.actuators, self._robot.fingers
         names = {
             "q": [f"q_{name}" for name in motors],

@@ -123,6 +123,7 @@ class _Signals:
             signal.signal(number, signal.SIG_IGN if is_ignored else default)
 
     def _stop(self, number: int, frame: FrameType | None) -> None:
+        """Raise KeyboardInterrupt, but only once CasADi has returned to its caller."""
         if self.is_finished or (self._terminated and number == signal.SIGTERM):
             return
         while frame is not None:

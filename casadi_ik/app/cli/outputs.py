@@ -116,6 +116,7 @@ def _identities(target: Path) -> list[object]:
 
 
 def _refuse_special(target: Path) -> None:
+    """Raise an OSError if a path exists but is not a file that can be written."""
     try:
         mode = target.stat().st_mode
     except FileNotFoundError:

@@ -305,6 +305,7 @@ def _panda_grasp_frames(transforms: Array) -> Array:
 
 
 def _pose_array(location: str, value: Any) -> Array:
+    """Return poses (k, 4, 4) of a data set, at least one."""
     try:
         transforms = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
@@ -316,6 +317,7 @@ def _pose_array(location: str, value: Any) -> Array:
 
 
 def _column(location: str, value: Any, count: int) -> Array:
+    """Return `count` numbers of a data set."""
     try:
         column = np.asarray(value, dtype=float).reshape(-1)
     except (TypeError, ValueError):
@@ -328,6 +330,7 @@ def _column(location: str, value: Any, count: int) -> Array:
 def _flat_row(
     location: str, parts: list[Any], sizes: tuple[int, ...], expected: str
 ) -> list[float]:
+    """Return the numbers of lists with the given sizes as one list."""
     numbers: list[float] = []
     for part, size in zip(parts, sizes, strict=True):
         values = part if isinstance(part, list) else []
@@ -342,6 +345,7 @@ def _as_tuple(rows: np.ndarray) -> tuple[int, ...]:
 
 
 def _read_json(path: Path) -> Mapping[str, Any]:
+    """Return the mapping of a JSON file."""
     try:
         content = json.loads(read_text(path, LIMITS.table_bytes))
     except (ValueError, RecursionError) as error:
@@ -352,6 +356,7 @@ def _read_json(path: Path) -> Mapping[str, Any]:
 
 
 def _read_npy_table(path: Path) -> Array:
+    """Return the rows of an npy file."""
     try:
         rows = np.lib.format.open_memmap(path, mode="r")
     except (OSError, *READ_ERRORS) as error:

@@ -520,6 +520,7 @@ def _enclosing_shapes(
 
 
 def _capsule_entry(capsule: FittedCapsule, capsule_excess: float) -> ShapeEntry:
+    """Return a capsule, or a sphere, whose rounded numbers enclose the fitted capsule."""
     first, last = (_rounded(end) for end in (capsule.first, capsule.last))
     radius = math.ceil(capsule.radius * SHAPE_FIT.grid + 0.9) / SHAPE_FIT.grid
     if first == last:
@@ -528,6 +529,7 @@ def _capsule_entry(capsule: FittedCapsule, capsule_excess: float) -> ShapeEntry:
 
 
 def _box_entry(box: FittedBox, box_excess: float) -> ShapeEntry:
+    """Return a box whose rounded numbers enclose the fitted box."""
     size = np.ceil(box.size * SHAPE_FIT.grid + 1.1) / SHAPE_FIT.grid
     rpy = np.round(roll_pitch_yaw(box.rotation), 4)
     if np.any(rpy):  # enlarge the box by the largest effect of rounding the angles
@@ -540,6 +542,7 @@ def _box_entry(box: FittedBox, box_excess: float) -> ShapeEntry:
 
 
 def _rounded(point: Array) -> tuple[float, float, float]:
+    """Return a point on the grid of `SHAPE_FIT`."""
     x, y, z = (np.round(point * SHAPE_FIT.grid) / SHAPE_FIT.grid + 0.0).tolist()
     return x, y, z
 
