@@ -146,7 +146,7 @@ class WholeNlp:
     """
 
     def __init__(self, robot: RobotDescription, options: IpoptParameters, kinds: Kinds) -> None:
-        """Build the graphs and both solvers, cold and warm."""
+        """Build the graphs, and the solvers of cold and warm starts."""
         n = len(robot.actuators)
         self.contacts = ContactRows(kinds)
         self.parameters = Layout(self.contacts.fields)
@@ -170,6 +170,7 @@ class WholeNlp:
         x, s = ca.SX.sym("x", n), ca.SX.sym("s", self._rows)
         scaled = x * self._scale
         start, pull = ca.SX.sym("start", n), ca.SX.sym("pull")
+        # The slacks s equal the residual, so the cost is a sum of squares of variables.
         rows = ca.vertcat(self.residual(scaled, p) - s, self._joints(scaled))
         self.program = {
             "x": ca.vertcat(x, s),
@@ -218,15 +219,15 @@ class WholeNlp:
             CancelledError: This thread has been told to stop.
         """
         stop_if_cancelled()
-        enforced = bool(np.all(lower >= self._lower))
+        enforces_limits = bool(np.all(lower >= self._lower))
         joints = (self._joint_lower, self._joint_upper)
-        if not enforced:
+        if not enforces_limits:
             joints = (np.full_like(joints[0], -np.inf), np.full_like(joints[1], np.inf))
         first = self._residual(start, parameters)
         cost = float(first @ first)
         if cost < MAX_SOLVED_RESIDUAL**2 and self._within(start, joints):
             return self._run_without_ipopt(start, first, Status.STALLED)
-        free, zero = np.full(self._rows, np.inf), np.zeros(self._rows)
+        unbounded, zero = np.full(self._rows, np.inf), np.zeros(self._rows)
         with self._lock, interrupt_afterwards():
             self._watch.begin(self._rows, joints)
             scaled_start, is_near = start / self._scale, cost < WARM_START_COST
@@ -236,8 +237,8 @@ class WholeNlp:
                 p=np.concatenate(
                     [parameters, scaled_start, [PROXIMITY_WEIGHT if is_near else 0.0]]
                 ),
-                lbx=np.concatenate([lower / self._scale, -free]),
-                ubx=np.concatenate([upper / self._scale, free]),
+                lbx=np.concatenate([lower / self._scale, -unbounded]),
+                ubx=np.concatenate([upper / self._scale, unbounded]),
                 lbg=np.concatenate([zero, joints[0]]),
                 ubg=np.concatenate([zero, joints[1]]),
             )
@@ -287,10 +288,10 @@ _ENDINGS = {
 
 
 def limited_joints(robot: RobotDescription) -> list[int]:
-    """Return the joints whose limits the bounds of q do not imply: indices in `robot.joint_names`.
+    """Return the indices in `robot.joint_names` of the joints that need limits besides those of q.
 
-    Every joint depends on one actuator, and where all couplings on the way are monotone, the
-    ends of the actuator's range tell.
+    Every joint depends on one actuator. If all couplings between them are monotone, the joint is
+    within its limits everywhere if it is at both ends of the actuator's range.
     """
     q = ca.SX.sym("q", len(robot.actuators))
     theta = ca.Function("theta", [q], [joint_positions(robot, q)])
@@ -331,8 +332,8 @@ JOINT_SLACK = 1e-9
 class Watch(ca.Callback):
     """Callback that stores every iterate and stops Ipopt at exact contacts or on cancellation.
 
-    For a program over x = (motors, slacks s) whose constraints are (r - s, joints). One solve at
-    a time: `begin`, then Ipopt, then `end`.
+    The variables of the program are x = (motors, slacks s), its constraints (r - s, joints). The
+    calls of a solve are `begin`, then those of Ipopt, then `end`; solves must not overlap.
     """
 
     def __init__(self, nx: int, ng: int, parameters: int) -> None:
@@ -396,15 +397,15 @@ AT_LIMIT = 1e-6
 
 
 class IpoptMethod(Method):
-    """`ipopt`: a start from q0, then random starts until the contacts are met.
+    """Method `ipopt`: a start from q0, then random starts until the contacts are met.
 
-    An iteration is a row of the trace: the first point and every step of Ipopt of each start. If no
-    start meets the contacts, the result with the smallest cost is returned. Threads solve one
-    after another, because Ipopt's callback serves one solve at a time.
+    The trace has a row for the first point and for every step of Ipopt, of each start; a row counts
+    as an iteration. If no start meets the contacts, the result with the smallest cost is returned.
+    Threads solve one after another, because Ipopt's callback serves one solve at a time.
 
     Attributes:
         name: Name of the method.
-        options: Its numbers.
+        options: Parameters of the method.
     """
 
     name = "ipopt"
@@ -420,9 +421,9 @@ class IpoptMethod(Method):
 
         Args:
             robot: The robot.
-            options: The numbers.
-            compiled: Makes no difference: Ipopt calls its graphs in the virtual machine.
-            kinds: Of the contacts, by finger; None: point and normal.
+            options: Parameters of the method.
+            compiled: Not used, because Ipopt evaluates its graphs in CasADi's virtual machine.
+            kinds: Kind of contact by finger; None: point and normal.
         """
         del compiled
         self._kinds = kinds or point_normal_kinds(len(robot.fingers))
@@ -538,12 +539,12 @@ class IpoptMethod(Method):
     def _goals(self, targets: TargetBatch) -> Array:
         """Return the parameters (k, ...) of the program; free vectors are zero."""
         layout, count = self.program.parameters, len(targets)
-        counts = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
+        is_set = [~np.isnan(array[..., 0]) for array in (targets.points, targets.normals)]
         values = {
             item.name: np.nan_to_num(targets.vectors(item.name))
             for item in layout
             if item.name != "weights"
-        } | {"weights": np.stack(counts, axis=2)}
+        } | {"weights": np.stack(is_set, axis=2)}
         goals = np.zeros((count, layout.size))
         for item in layout:
             goals[:, layout.slice(item.name)] = values[item.name].reshape(count, item.size)

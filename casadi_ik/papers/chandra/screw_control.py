@@ -185,9 +185,9 @@ class ScrewControl:
             >>> {name: value.shape for name, value in control.target(ar10.home).items()}
             {'pose': (8,)}
         """
-        fulfilled = _target_kernel(self._step, self._compiled)(self._posture(q, "q"))
+        values = _target_kernel(self._step, self._compiled)(self._posture(q, "q"))
         names = [field.name for field in self.task.target_fields]
-        return dict(zip(names, fulfilled, strict=True))
+        return dict(zip(names, values, strict=True))
 
     def run(
         self,
@@ -259,12 +259,14 @@ class ScrewControl:
         return Stepper(self.kernel, start, vector)
 
     def _posture(self, q: ArrayLike | None, name: str) -> Array:
+        """Return a checked configuration (n,); None: home."""
         array = self.robot.configuration(q, name)
         if array.ndim != 1:
             raise InputError(f"{name}: found shape {array.shape}, expected ({array.shape[1]},)")
         return array
 
     def _checked(self, target: Mapping[str, ArrayLike]) -> dict[str, Array]:
+        """Return the checked values of a target, with unit normals and unit dual quaternions."""
         expected = {field.name: field.shape for field in self.task.target_fields}
         if set(target) != set(expected):
             raise InputError(

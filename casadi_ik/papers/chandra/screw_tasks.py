@@ -90,8 +90,8 @@ class Rows:
     """Rows of a task at a configuration.
 
     Attributes:
-        error: (m, 1) desired minus current [m, rad].
-        jacobian: (m, k) by the actuators of the tip.
+        error: (m, 1) desired minus current values [m, rad].
+        jacobian: (m, k) Jacobian with respect to the k actuators that move the tip.
         linear: Number of leading rows that are lengths [m]; the others are angles [rad].
     """
 
@@ -102,7 +102,7 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Tip:
-    """A fingertip as the tasks use it.
+    """Kinematics of a fingertip in the frame of the target.
 
     Attributes:
         motion: Screws of the tip.
@@ -121,17 +121,20 @@ class Tip:
 
     @property
     def angular(self) -> Expr:
-        """(3, k) angular velocity per unit rate."""
+        """(3, k) angular velocity per unit velocity of each actuator."""
         return self.motion.jacobian[3:, :]
 
     @property
     def linear(self) -> Expr:
-        """(3, k) velocity of the contact point per unit rate: v + w x p of the screws."""
+        """(3, k) velocity of the contact point per unit velocity of each actuator.
+
+        The screws have the velocity v at the origin and the angular velocity w: v + w x p.
+        """
         columns = ca.horzsplit(self.motion.jacobian)
         return ca.horzcat(*(twist[:3] + ca.cross(twist[3:], self.point) for twist in columns))
 
     @property
-    def normal_now(self) -> Expr:
+    def current_normal(self) -> Expr:
         """(3, 1) pad normal in the frame of the target."""
         return dq.rotate(self.motion.pose, self.normal)
 
@@ -147,7 +150,7 @@ def values(task: ScrewTask, robot: RobotDescription, q: Expr) -> dict[str, Expr]
     all_values = {
         "pose": fingertip.motion.pose,
         "point": fingertip.point,
-        "normal": fingertip.normal_now,
+        "normal": fingertip.current_normal,
         "distance": safe_norm(fingertip.point),
     }
     return {field.name: all_values[field.name] for field in task.target_fields}
@@ -196,7 +199,7 @@ def _distance(tip: Tip, target: dict[str, Expr]) -> Rows:
 
 def _contact(tip: Tip, target: dict[str, Expr]) -> Rows:
     """Return point and normal; the rotation about the normal is free."""
-    normal = tip.normal_now
+    normal = tip.current_normal
     tilting = tip.angular - normal @ (normal.T @ tip.angular)
     return Rows(
         ca.vertcat(target["point"] - tip.point, normal_error(normal, target["normal"])),
@@ -323,7 +326,8 @@ class ScrewControlStep:
         reach = p["largest_step"][moving]
         low = ca.fmax(ca.DM(lower) - q[moving], -reach) / half_range
         high = ca.fmin(ca.DM(upper) - q[moving], reach) / half_range
-        # The unknown is s - z, which starts at 0, so z must lie in the box.
+        # The step s, relative to half ranges, is as near as possible to the centring step z. The
+        # unknown is s - z, which starts at 0, so z must lie in the box.
         z = ca.fmin(ca.fmax(p["centring"] * (middle - q[moving]) / half_range, low), high)
         demand = p["gain"] * weights * objective.error
         box = BoxBounds(z, low, high, first=0)

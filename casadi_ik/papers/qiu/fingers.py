@@ -47,9 +47,9 @@ class PlanarFinger:
 
     Attributes:
         name: Name of the finger.
-        spread_motor: Index in q of the spread actuator, or None.
+        spread_motor: Index in q of the spread actuator; None without spread.
         ratio: Spread joint angle per unit of its actuator.
-        offset: Spread joint angle at actuator zero [rad].
+        offset: Spread joint angle at actuator position 0 [rad].
         spread_limits: (2,) limits of the spread joint [rad]; zeros without spread.
         flexion: Indices in q of the two flexion actuators, proximal first.
         flexion_limits: (2, 2) lower and upper limit of each flexion joint [rad].
@@ -57,7 +57,7 @@ class PlanarFinger:
         normal_angle: Angle a_0 of the pad normal from z towards x at zero flexion [rad].
         proximal: (3,) point on the first flexion axis in the finger frame [m].
         middle: (3,) vector from this point to the second flexion axis at zero flexion [m].
-        tip: (3,) vector from there to the contact at zero flexion [m].
+        tip: (3,) vector from the second flexion axis to the contact at zero flexion [m].
         facing: +1 if the pad faces +x of the finger frame in its flexion range, else -1.
     """
 
@@ -362,6 +362,7 @@ def wrap(angle: Expr) -> Expr:
 
 
 def _in_finger_frame(finger: PlanarFinger, goal: Target) -> Target:
+    """Return a target of the palm frame in the finger frame."""
     rotation = ca.DM(finger.frame[:3, :3].T)
     origin = ca.DM(finger.frame[:3, 3])
     return Target(rotation @ (goal.point - origin), rotation @ goal.normal)
@@ -376,7 +377,7 @@ def _spreads(
     """Return the spread angle of every finger; fingers on one motor share one angle."""
     angles: dict[int, Expr] = {}
     for motor in {finger.spread_motor for finger in fingers if finger.spread_motor is not None}:
-        total, weights = CURRENT_SPREAD_WEIGHT * q[motor], CURRENT_SPREAD_WEIGHT
+        weighted_sum, sum_of_weights = CURRENT_SPREAD_WEIGHT * q[motor], CURRENT_SPREAD_WEIGHT
         lower, upper = _spread_range(robot, fingers, motor)
         for finger, goal in zip(fingers, local, strict=True):
             if finger.spread_motor == motor:
@@ -384,9 +385,9 @@ def _spreads(
                 azimuth = ca.atan2(finger.facing * goal.normal[1], finger.facing * goal.normal[0])
                 angle = middle + wrap(azimuth - middle)
                 weight = goal.normal[0] ** 2 + goal.normal[1] ** 2
-                total += weight * (angle - finger.offset) / finger.ratio
-                weights += weight
-        angles[motor] = clamp(total / weights, lower, upper)
+                weighted_sum += weight * (angle - finger.offset) / finger.ratio
+                sum_of_weights += weight
+        angles[motor] = clamp(weighted_sum / sum_of_weights, lower, upper)
     return [
         0.0
         if finger.spread_motor is None

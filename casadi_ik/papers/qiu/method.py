@@ -1,7 +1,7 @@
 """The methods of Qiu & Kermani 2021, each as one compiled loop.
 
-*Enhanced:* thumb reaching, then hand alignment. *Original*, of the paper's comparison: all contacts
-in one hierarchy.
+The enhanced methods are those that the paper proposes: thumb reaching, then hand alignment. The
+original methods are its baseline: all contacts in one hierarchy of tasks.
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ class EnhancedStep(QiuStep[QiuParameters]):
         planar_fingers(robot)  # raises here rather than when the graph is built
         state = (
             Field("phase"),
-            Field("best", doc="smallest summed error of thumb reaching so far"),
-            Field("waited", doc="iterations since `best` fell"),
-            Field("reached", doc="iterations spent in thumb reaching"),
+            Field("least_error", doc="smallest summed error of thumb reaching so far"),
+            Field("slow_iterations", doc="iterations since `least_error` decreased by 1 %"),
+            Field("n_reaching", doc="number of iterations of thumb reaching"),
         )
         numbers = (
             Field("reaching_damping"),
@@ -91,7 +91,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
             Field("reaching_iterations"),
             Field("step_cap"),
         )
-        measured = (
+        measurements = (
             Field("palm_error", (), "f4", "rad", "palm orientation task error (phase 1)"),
             Field("palm_motion", (2,), "f4", "mm, rad", "palm motion demanded (phase 2)"),
             STEP_SIZE.for_robot(robot, "largest motor change of this iteration"),
@@ -100,16 +100,16 @@ class EnhancedStep(QiuStep[QiuParameters]):
             Field("sigma_closed_chain", (), "f4", "", "smallest singular value of H_p (phase 2)"),
             Field("condition_closed_chain", (), "f4", "", "condition number of H_p (phase 2)"),
         )
-        super().__init__(robot, options, state, numbers, measured)
+        super().__init__(robot, options, state, numbers, measurements)
 
     @property
     def jacobians(self) -> dict[str, RecordedJacobian]:
         """Jacobians in the record.
 
-        The paper names no thresholds; these are ours. A metre of the thumb's tip asks for more
-        than 20 rad of some joint, a rad of the palm for more than 2 rad, the platform for passive
-        joints that move 100 times as far as it turns. H_p has lengths in millimetres: its condition
-        number is above 400 everywhere.
+        The thresholds of singularity are not from the paper. Beyond them a metre of the thumb's tip
+        requires more than 20 rad of a joint, a radian of the palm more than 2 rad, and a radian of
+        the platform more than 100 rad of the passive joints. H_p has lengths in millimetres, so its
+        condition number is above 400 everywhere.
         """
         names = self.robot.actuator_names
         arm = tuple(names[i] for i in self.robot.arm_actuators)
@@ -135,14 +135,14 @@ class EnhancedStep(QiuStep[QiuParameters]):
         largest = float(np.finfo(float).max)
         initial = {
             "phase": float(Phase.THUMB_REACHING),
-            "best": largest,
-            "waited": 0.0,
-            "reached": 0.0,
+            "least_error": largest,
+            "slow_iterations": 0.0,
+            "n_reaching": 0.0,
         }
         return super().first_state(starts) | initial
 
     def row(
-        self, q: Expr, positions: Expr, angles: Expr, *, phase: Phase, **measured: Expr
+        self, q: Expr, positions: Expr, angles: Expr, *, phase: Phase, **measurements: Expr
     ) -> ca.SX:
         """Return the log record of an iteration.
 
@@ -151,7 +151,7 @@ class EnhancedStep(QiuStep[QiuParameters]):
             positions: (f, 1) position errors [m].
             angles: (f, 1) angle errors [rad].
             phase: Phase of the iteration.
-            measured: Further fields that the phase defines.
+            measurements: Further fields that the phase defines.
         """
         values: dict[str, Expr] = {
             "q": q,
@@ -165,9 +165,10 @@ class EnhancedStep(QiuStep[QiuParameters]):
             "limit_mask": limit_mask(self.robot, q),
             "phase": float(phase),
         }
-        return self.record.pack(values | measured)
+        return self.record.pack(values | measurements)
 
     def _iteration(self) -> ca.Function:
+        """Return the graph of an iteration: the finger step, then the graph of the phase."""
         state = ca.MX.sym("state", self.state.size)
         parameters = ca.MX.sym("parameters", self.parameters.size)
         fingers = finger_step_function(self.robot, self.options.finger_step)
@@ -214,20 +215,21 @@ class EnhancedStep(QiuStep[QiuParameters]):
         )
         if self.options.palm_task:
             errors = ca.vertcat(errors, safe_norm(palm.error) / p["angle_tolerance"][thumb])
-        within, summed = ca.mmax(errors) <= 1, ca.sum1(errors)
-        better = summed < 0.99 * s["best"]
-        slow_iterations = ca.if_else(better, 0.0, s["waited"] + 1)
-        enough = ca.logic_or(
-            slow_iterations >= p["reaching_patience"], s["reached"] + 1 >= p["reaching_iterations"]
+        is_met, summed_error = ca.mmax(errors) <= 1, ca.sum1(errors)
+        is_gain = summed_error < 0.99 * s["least_error"]
+        slow_iterations = ca.if_else(is_gain, 0.0, s["slow_iterations"] + 1)
+        is_limit_reached = ca.logic_or(
+            slow_iterations >= p["reaching_patience"],
+            s["n_reaching"] + 1 >= p["reaching_iterations"],
         )
-        finished = ca.logic_or(within, enough)
+        is_finished = ca.logic_or(is_met, is_limit_reached)
         new_state = self.state.pack(
             {
-                "q": ca.if_else(within, s["q"], q_next),
-                "phase": ca.if_else(finished, float(Phase.HAND_ALIGNMENT), s["phase"]),
-                "best": ca.if_else(better, summed, s["best"]),
-                "waited": ca.if_else(finished, 0.0, slow_iterations),
-                "reached": s["reached"] + 1,
+                "q": ca.if_else(is_met, s["q"], q_next),
+                "phase": ca.if_else(is_finished, float(Phase.HAND_ALIGNMENT), s["phase"]),
+                "least_error": ca.if_else(is_gain, summed_error, s["least_error"]),
+                "slow_iterations": ca.if_else(is_finished, 0.0, slow_iterations),
+                "n_reaching": s["n_reaching"] + 1,
             }
         )
         status = ca.SX(float(Status.RUNNING))
@@ -245,7 +247,10 @@ class EnhancedStep(QiuStep[QiuParameters]):
         return ca.Function("reach", [state, parameters], with_cse(new_state, record, status))
 
     def _align(self) -> ca.Function:
-        """Return the graph of hand alignment (section II-C), after the finger step."""
+        """Return the graph of hand alignment (section II-C), after the finger step.
+
+        Its inputs are state, parameters, and the configuration `closed` after the finger step.
+        """
         state, parameters, s, p = self._inputs()
         closed = ca.SX.sym("closed", len(self.robot.actuators))
         robot, body, goals = self.robot, actuated(self.robot, closed), goal_contacts(self.robot, p)
@@ -264,10 +269,11 @@ class EnhancedStep(QiuStep[QiuParameters]):
             )
 
         columns = robot.arm_actuators + robot.finger_actuators(robot.thumb)
-        keep = contact_tasks(
+        # The thumb returns to its contact.
+        thumb_tasks = contact_tasks(
             actuated(robot, q_after_chain), robot.thumb, goals[robot.thumb], columns
         )
-        step = self._expand_step(self._combined(keep, self._reaching(p)), columns)
+        step = self._expand_step(self._combined(thumb_tasks, self._reaching(p)), columns)
         q_next = self._step_within_limits(q_after_chain, step, p)
 
         status = ca.if_else(solved, float(Status.SOLVED), float(Status.RUNNING))
@@ -369,7 +375,7 @@ class OriginalStep(QiuStep[OriginalParameters]):
         if self.options.projection == "stacked":
             step = self._stacked()(parameters, *pairs)
         else:
-            # Instruction fetch bounds an iteration: tasks of one size share one function.
+            # Instruction fetch limits the speed, so tasks of the same size share a function.
             sizes = {len(columns) for _, columns in self._kinds}
             solve = {size: self._solve(size) for size in sorted(sizes)}
             slice_of = self.parameters.slice
@@ -398,9 +404,11 @@ class OriginalStep(QiuStep[OriginalParameters]):
         return self.options.palm_task and bool(self.robot.arm_actuators)
 
     def _view(self) -> ca.Function:
-        """Return the errors (f, 2) of all fingers in point and normal, then all tasks by priority.
+        """Return ``(state, parameters) -> (errors, task, task, ...)``.
 
-        A task is its Jacobian over the actuators that move it, and its error, [J, e] (3, k + 1).
+        The errors (f, 2) are those of points [m] and normals [rad] of all fingers. The tasks follow
+        by decreasing priority, each as a pair [J, e] (3, k + 1) of the Jacobian with respect to the
+        k actuators that move the task, and its error.
         """
         state, parameters, s, p = self._inputs()
         robot, goals, body = self.robot, goal_contacts(self.robot, p), actuated(self.robot, s["q"])
@@ -530,7 +538,7 @@ class EnhancedMethod(_QiuMethod[EnhancedStep]):
     def __init__(
         self, robot: RobotDescription, options: QiuParameters, compiled: bool = True
     ) -> None:
-        """Lay out the step; the budget is the paper's."""
+        """Lay out the step and set the maximum number of iterations."""
         super().__init__(robot, options, compiled)
         self.name = f"enhanced-{options.steps}"
         robot.require_single_hand(self.name)
@@ -539,7 +547,7 @@ class EnhancedMethod(_QiuMethod[EnhancedStep]):
 
     def phase_counts(self, states: Array, iterations: Counts) -> Mapping[Phase, Counts]:
         """Return the iterations by phase; those after thumb reaching are hand alignment."""
-        reaching_iterations = states[:, self.step.state.slice("reached").start].astype(
+        reaching_iterations = states[:, self.step.state.slice("n_reaching").start].astype(
             iterations.dtype
         )
         return {
@@ -559,7 +567,7 @@ class OriginalMethod(_QiuMethod[OriginalStep]):
     def __init__(
         self, robot: RobotDescription, options: OriginalParameters, compiled: bool = True
     ) -> None:
-        """Lay out the step; the budget is the paper's."""
+        """Lay out the step and set the maximum number of iterations."""
         super().__init__(robot, options, compiled)
         self.name = f"original-{options.steps}"
         robot.require_single_hand(self.name)

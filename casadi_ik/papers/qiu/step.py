@@ -26,24 +26,23 @@ PROJECTIONS = (*HIERARCHIES, "stacked")
 """Combination of the tasks of the original methods: a hierarchy, or one damped least-squares
 problem (only with DLS, because selective damping is per task)."""
 
-PROJECTORS = ("exact", "damped")
-
 FINGER_STEPS = ("ipopt", "closed-form")
-PALM_ERRORS = ("euler", "rotation-vector")
-PLATFORMS = ("arm-leg", "palm")
-STEPS = ("dls", "sdls")
-CHAIN_TASKS = ("successive", "stacked")
+"""Solvers of the other fingers, see `QiuParameters.finger_step`."""
+
 CHOICES = {
-    "chain_tasks": CHAIN_TASKS,
-    "steps": STEPS,
+    "chain_tasks": ("successive", "stacked"),
+    "steps": ("dls", "sdls"),
     "finger_step": FINGER_STEPS,
-    "palm_error": PALM_ERRORS,
-    "platform": PLATFORMS,
+    "palm_error": ("euler", "rotation-vector"),
+    "platform": ("arm-leg", "palm"),
     "projection": PROJECTIONS,
-    "projectors": PROJECTORS,
+    "projectors": ("exact", "damped"),
     "order": ORDERS,
 }
+"""Admissible values by parameter; the parameter records describe them."""
+
 MAY_BE_ZERO = ("borrowed",)
+"""Numeric parameters whose value may be zero; the others are positive."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +54,11 @@ class QiuParameters:
 
     Attributes:
         steps: Solver of a task: "dls" (Wampler 1986) or "sdls" (Buss & Kim 2005).
-        reaching_damping: lambda of thumb reaching (paper: 1), squared in the normal matrix.
-            [mm] in the position task, [rad/rad] in the orientation tasks.
-        chain_damping: lambda of the closed chain (paper: 150), squared in the normal matrix.
-            Read as 150 rather than 150^2 in the matrix (a value of 12.25 here), success falls from
-            97 % to 82 % (12 shipped grasps x 40 random arms, limits ignored).
+        reaching_damping: Damping lambda of thumb reaching (paper: 1), squared in the normal matrix;
+            in [mm] for the position task, in [rad/rad] for the orientation tasks.
+        chain_damping: Damping lambda of the closed chain (paper: 150), squared in the normal
+            matrix. Source: if 150 itself is the term of the matrix (a value of 12.25 here), success
+            falls from 97 % to 82 % (12 shipped grasps x 40 random arms, limits ignored).
         reaching_gamma: SDLS: largest joint change in one step of thumb reaching (paper: pi/9)
             [rad].
         chain_gamma: SDLS: largest joint change in one step of the closed chain (paper: pi/500)
@@ -68,26 +67,28 @@ class QiuParameters:
         widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
         virtual_weight: Weight of the virtual joint in the closed chain (paper: 10).
         joint_weight: Weight of the other active joints (paper: 1).
-        palm_error: "euler": differences of Euler angles as the paper writes; it names no
-            convention, taken is ZYX, each difference wrapped to (-pi, pi]. "rotation-vector":
-            rotation logarithm and geometric Jacobian, free of the Euler singularity.
+        palm_error: "euler": differences of Euler angles, as in the paper, which does not name the
+            convention; here it is ZYX, and each difference is wrapped to (-pi, pi].
+            "rotation-vector": rotation logarithm and geometric Jacobian, which have no Euler
+            singularity.
         palm_task: True if the estimated palm orientation is the first task of thumb reaching
             (paper: yes).
         closed_chain: True if the closed chain moves the palm (paper: yes); otherwise only the
             fingers close.
-        chain_tasks: "successive": the palm's position, its orientation in the null space of that
-            (paper). "stacked": both as one task, its rotations times `chain_lever`.
+        chain_tasks: "successive": the palm's position, and its orientation in the null space of the
+            position (paper). "stacked": both as one task, with rotations times `chain_lever`.
         chain_lever: Length that converts palm rotation to translation [mm/rad].
         platform: Body whose twist J_cc of eq. (8) describes: "arm-leg" as printed (without the
             last joint of the arm), or "palm" with it.
-        borrowed: Arm joints counted to the reversed thumb (paper: 1, the 7th).
+        borrowed: Number of the last arm joints that belong to the leg of the thumb in the closed
+            chain (paper: 1, the 7th joint).
         finger_step: Solver of eq. (5): "ipopt" (the paper: fmincon) or "closed-form" (the same
-            answer, much faster).
-        reaching_patience: Thumb reaching ends when palm and thumb are within tolerance. The
-            paper does not say what happens when the tasks conflict and they never are: here it
-            also ends after this many iterations without a gain of 1 % in the summed errors.
+            result, much faster).
+        reaching_patience: Number of iterations without a gain of 1 % in the summed errors after
+            which thumb reaching ends although palm and thumb are not within tolerance. The paper
+            does not specify the end if the tasks conflict.
         reaching_iterations: Maximum number of iterations of thumb reaching.
-        step_cap: Largest change of a motor per iteration [rad or m]; the paper has no cap.
+        step_cap: Largest change of a motor per iteration [rad or m] (paper: unlimited).
         max_iterations: Maximum number of iterations of both phases together (paper: 10,000).
     """
 
@@ -134,10 +135,11 @@ def _check_fields(record: QiuParameters | OriginalParameters) -> None:
 
 def _check_number(name: str, value: object, is_integer: bool) -> None:
     kind, types = ("an integer", (int,)) if is_integer else ("a number", (int, float))
-    zero = name in MAY_BE_ZERO
-    number = isinstance(value, types) and not isinstance(value, bool)
-    if not (number and (value > 0 or (zero and value == 0))):  # type: ignore[operator]
-        bound = ">= 0" if zero else "> 0"
+    may_be_zero = name in MAY_BE_ZERO
+    is_number = isinstance(value, types) and not isinstance(value, bool)
+    is_positive = is_number and value > 0  # type: ignore[operator]
+    if not (is_positive or (is_number and may_be_zero and value == 0)):
+        bound = ">= 0" if may_be_zero else "> 0"
         raise InputError(f"{name}: found {value!r}, expected {kind} {bound}")
 
 
@@ -145,20 +147,20 @@ def _check_number(name: str, value: object, is_integer: bool) -> None:
 class OriginalParameters:
     """Parameters of the original methods, the baseline of the paper: one hierarchy of all motors.
 
-    The paper says only "the methods without the enhancement of the proposed approach". The
-    defaults carry the hierarchy of its thumb reaching on to the other fingers: the palm's
-    orientation, then point and normal finger by finger, the thumb first; augmented projection,
-    with the pseudoinverse in the projectors damped like a task's own. Of all readings it is among
-    the closest to the printed means; `studies/table_one.py` measures them all.
+    The paper specifies only "the methods without the enhancement of the proposed approach". The
+    defaults extend the hierarchy of its thumb reaching to the other fingers: the palm's
+    orientation, then point and normal finger by finger, beginning with the thumb. The projection is
+    augmented, and the projectors have the damping of the tasks. The means of this reading are among
+    the closest to the printed ones; `studies/table_one.py` measures all readings.
 
     Attributes:
-        steps: How a task is solved: "dls" or "sdls".
-        palm_task: Whether the palm's estimated orientation is the first task.
+        steps: Solver of a task: "dls" or "sdls".
+        palm_task: True if the estimated palm orientation is the first task.
         order: Order of the contact tasks, see `ORDERS`; the thumb is the first finger.
-        projection: Projection that keeps lower tasks from disturbing higher ones, see `combine`;
-            "stacked": one problem of all tasks without priorities.
-        projectors: Their pseudoinverse: "exact", or "damped" by `damping` like a task's own.
-        damping: lambda (paper: 1) [mm; rad/rad].
+        projection: Projection that prevents tasks from disturbing those of higher priority, see
+            `combine`; "stacked": one problem of all tasks without priorities.
+        projectors: Pseudoinverse in the projectors: "exact", or "damped" by `damping`.
+        damping: Damping lambda of a task (paper: 1) [mm; rad/rad].
         gamma: SDLS: largest joint change in one step (paper: pi/9) [rad].
         longest_error: SDLS: position errors are shortened to this (paper: 200) [mm].
         widest_error: SDLS: orientation errors are shortened to this (paper: pi/6) [rad].
@@ -193,6 +195,9 @@ class QiuStep(Generic[Options]):
     Attributes:
         robot: Description of the robot.
         options: Parameters of the method; numeric ones are parameters of the graph.
+        family: Prefix of the name of the graph.
+        compilable: False if the graph can only run in CasADi's virtual machine.
+        stage: Field of the state with the stage, "" if there is only one.
         state: Layout of the state that an iteration passes to the next.
         parameters: Layout of the target and the numeric parameters.
         record: Layout of the log record of an iteration.
@@ -208,7 +213,7 @@ class QiuStep(Generic[Options]):
         options: Options,
         state: Sequence[Field],
         numbers: Sequence[Field],
-        measured: Sequence[Field],
+        measurements: Sequence[Field],
     ) -> None:
         """Lay out state, parameters and record.
 
@@ -217,7 +222,7 @@ class QiuStep(Generic[Options]):
             options: Parameters of the method.
             state: Fields of the state in addition to q.
             numbers: Fields of the parameters in addition to targets and limits.
-            measured: Fields of the record between the errors and the limits.
+            measurements: Fields of the record between the errors and the limits.
         """
         limits = Field("enforce_limits", doc="1: q is kept within its limits, 0: it is not")
         self.robot, self.options = robot, options
@@ -225,7 +230,7 @@ class QiuStep(Generic[Options]):
         self.parameters = Layout((*target_fields(robot), limits, *numbers))
         first, last = (Q, POSITION_ERROR, ANGLE_ERROR), (LIMIT_MASK, PHASE, STATUS)
         fields_of_robot = [[field.for_robot(robot) for field in fields] for fields in (first, last)]
-        self.record = Layout.record(*fields_of_robot[0], *measured, *fields_of_robot[1])
+        self.record = Layout.record(*fields_of_robot[0], *measurements, *fields_of_robot[1])
 
     def graph(self) -> StepGraph:
         """Return the step graph."""
@@ -254,11 +259,11 @@ class QiuStep(Generic[Options]):
 
     def parameter_values(self, targets: TargetBatch) -> dict[str, float | list[float] | Array]:
         """Return the values of all parameter fields for a batch."""
-        named = (name for name in self.parameters.names if hasattr(self.options, name))
+        option_names = [name for name in self.parameters.names if hasattr(self.options, name)]
         return {
             **target_values(targets),
             "enforce_limits": float(targets.enforce_limits),
-            **{name: float(getattr(self.options, name)) for name in named},
+            **{name: float(getattr(self.options, name)) for name in option_names},
         }
 
     def _inputs(self) -> tuple[ca.SX, ca.SX, dict[str, ca.SX], dict[str, ca.SX]]:

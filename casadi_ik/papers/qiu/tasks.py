@@ -35,7 +35,7 @@ from casadi_ik.kinematics.smooth import Expr, safe_norm
 from casadi_ik.model.description import RobotDescription
 
 MILLIMETRE = 1e-3
-"""Millimetres per metre: the damping factors of the paper refer to millimetres and radians."""
+"""Length of a millimetre [m]; the damping factors of the paper refer to millimetres and radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ def palm_orientation_task(
     Args:
         body: Kinematics over q.
         desired: (3, 3) desired orientation of the palm, base frame.
-        actuators: Columns of the Jacobian.
+        actuators: Indices in q of the actuators: the columns of the Jacobian.
         euler: True: differences of ZYX Euler angles, each wrapped to (-pi, pi], and the analytic
             Jacobian. False: rotation logarithm and geometric Jacobian.
     """
@@ -243,12 +243,12 @@ def selectively_damped(jacobian: Expr, error: Expr, gamma_max: Expr) -> Expr:
     largest = ca.fmax(ca.mmax(s), 1e-300)
     for i in range(s.shape[0]):
         v = V[:, i]
-        counts = s[i] > NEGLIGIBLE * largest
-        inverse = 1 / ca.if_else(counts, s[i], 1.0)
+        is_nonzero = s[i] > NEGLIGIBLE * largest
+        inverse = 1 / ca.if_else(is_nonzero, s[i], 1.0)
         effort = inverse * ca.dot(ca.fabs(v), reach)
         gamma = gamma_max * ca.fmin(1.0, 1 / ca.fmax(effort, 1e-300))
         phi = shorten(inverse * ca.dot(U[:, i], error) * v, gamma)
-        total = total + ca.if_else(counts, phi, 0.0)
+        total = total + ca.if_else(is_nonzero, phi, 0.0)
     return shorten(total, gamma_max)
 
 
@@ -331,11 +331,11 @@ def palm_motion(body: ActuatedKinematics, goals: dict[str, Target]) -> tuple[ca.
         point, normal = body.kinematics.contact(name)
         # In palm coordinates, the shortest rotation between the normals already includes the
         # similarity transform of eq. (12) by the fingertip frame.
-        turn = rotation_between(palm.rotation.T @ normal, palm.rotation.T @ goal.normal)
+        rotation = rotation_between(palm.rotation.T @ normal, palm.rotation.T @ goal.normal)
         shift = palm.rotation.T @ (goal.point - point) / MILLIMETRE
-        twist = log_se3((turn, shift))
+        twist = log_se3((rotation, shift))
         lever = palm.inverse_apply(point) / MILLIMETRE
-        rotations.append(turn)
+        rotations.append(rotation)
         translations.append(twist[:3] - ca.cross(twist[3:], lever))
     translation = sum(translations[1:], translations[0]) / len(translations)
     if len(rotations) == 2:

@@ -1,4 +1,4 @@
-"""Calibration: the hand's own dimensions from measured fingertip poses."""
+"""Calibration: dimensions of an individual hand from measured fingertip poses."""
 
 from casadi_ik.papers.chandra.calibration.estimate import (
     LOSSES,

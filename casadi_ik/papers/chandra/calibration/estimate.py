@@ -78,15 +78,15 @@ class EstimateSettings:
     """Settings of the estimate.
 
     Attributes:
-        unknown: Singular value, relative to the largest, below which the data contain no
-            information.
-        fewest: Smallest number of redundant measured values from which noise is estimated.
+        min_singular_value: Singular value, relative to the largest, below which the data contain no
+            information about a direction.
+        min_redundancy: Minimum number of redundant measured values for an estimate of the noise.
         max_iterations: Maximum number of steps.
         smallest_step: Step length at which the iteration ends [prior standard deviations].
     """
 
-    unknown: float = 1e-6
-    fewest: int = 12
+    min_singular_value: float = 1e-6
+    min_redundancy: int = 12
     max_iterations: int = 60
     smallest_step: float = 1e-7
 
@@ -171,7 +171,9 @@ class Calibration:
     @property
     def unknown_directions(self) -> int:
         """Number of directions about which the data contain no information."""
-        return int(np.sum(self.singular_values < SETTINGS.unknown * self.singular_values[0]))
+        return int(
+            np.sum(self.singular_values < SETTINGS.min_singular_value * self.singular_values[0])
+        )
 
 
 CHI_SQUARE_MEDIAN = 2.366
@@ -209,16 +211,16 @@ def calibrate(
     noise = np.array([sigma_position, sigma_angle])
     x = np.zeros(len(model.parameters))
     initial_errors, _ = fit.misfit(x)
-    estimated = fit.enough()
+    estimates_noise = fit.can_estimate_noise()
     converged, steps = False, 0
     while not converged and steps < SETTINGS.max_iterations:
         step = fit.step(x, noise)
-        x, last = x + step, noise
-        noise = fit.noise(x, last) if estimated else last
+        x, previous_noise = x + step, noise
+        noise = fit.noise(x, previous_noise) if estimates_noise else previous_noise
         converged = bool(np.abs(step).max() < SETTINGS.smallest_step)
-        converged = converged and bool(np.allclose(noise, last, rtol=1e-4))
+        converged = converged and bool(np.allclose(noise, previous_noise, rtol=1e-4))
         steps += 1
-    return fit.result(x, noise, estimated, initial_errors, steps, converged)
+    return fit.result(x, noise, estimates_noise, initial_errors, steps, converged)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +250,8 @@ class _Fit:
         errors, jacobians = self.misfit(x)
         white, rho, _ = self.whitened(errors, noise)
         roots = np.sqrt(self.loss.weight(rho))
-        # Stacked, not squared: with good data some directions are known a billion times better.
+        # The rows are stacked: normal equations would square the condition number, which good data
+        # make as large as 1e9.
         rows = np.vstack([_stacked(jacobians, noise, roots), np.eye(len(x))])
         right = -np.concatenate([(roots[:, None] * white).ravel(), x])
         lower, upper = self._bounds()
@@ -266,14 +269,12 @@ class _Fit:
         numbers = np.where(self.measurements.has_orientation, 6.0, 3.0)
         return white, np.sqrt((white**2).sum(axis=1) / numbers), numbers
 
-    def enough(self) -> bool:
-        """Return whether there are enough redundant rows to estimate the noise."""
+    def can_estimate_noise(self) -> bool:
+        """Return True if there are enough redundant measured values to estimate the noise."""
         _, jacobians = self.misfit(np.zeros(len(self.model.parameters)))
         rows = jacobians.reshape(-1, jacobians.shape[2])
-        return (
-            self._rows() - int(np.linalg.matrix_rank(rows, rtol=SETTINGS.unknown))
-            >= SETTINGS.fewest
-        )
+        rank = int(np.linalg.matrix_rank(rows, rtol=SETTINGS.min_singular_value))
+        return self._rows() - rank >= SETTINGS.min_redundancy
 
     def noise(self, x: Array, noise: Array) -> Array:
         """Return standard deviations from medians of the errors, which are robust to outliers."""
