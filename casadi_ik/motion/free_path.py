@@ -51,7 +51,8 @@ class _Samples:
         q: (m, n) postures.
         solid_poses: (m, s, 12) poses of the scene's solids.
         shapes: (m, p) positions of the robot's shapes, see `ClearanceKernel.shape_poses`.
-        clearances: (m, 3) clearance beyond the margin [m], clearance [m], number of its pair.
+        clearances: (m, 3) columns: clearance beyond the margin [m], clearance [m], and index of the
+            nearest pair.
     """
 
     q: Array
@@ -290,14 +291,7 @@ def plan_path(
     util.setLogLevel(util.LogLevel.LOG_NONE)
     util.RNG.setSeed(seed + 1)  # OMPL uses the first seed of a process
     n = len(start)
-    endless = robot.description.continuous
-    lower = np.where(endless, np.minimum(start, end) - np.pi, robot.lower)
-    upper = np.where(endless, np.maximum(start, end) + np.pi, robot.upper)
-    if not (query is None or isinstance(query, CollisionQuery)):
-        # The hand keeps its grasp; the interval allows for rounding.
-        hand = np.isin(np.arange(n), robot.description.hand_actuators)
-        lower = np.where(hand, np.minimum(start, end) - 1e-7, lower)
-        upper = np.where(hand, np.maximum(start, end) + 1e-7, upper)
+    lower, upper = _search_bounds(robot, start, end, carries=not isinstance(query, CollisionQuery))
     space = base.RealVectorStateSpace(n)
     bounds = base.RealVectorBounds(n)
     for i in range(n):
@@ -322,17 +316,36 @@ def plan_path(
         setup.setPlanner(geometric.RRTConnect(information))
         setup.solve(limit)
         if not setup.haveExactSolutionPath():
-            return (
-                None,
-                f"the straight path is not free, and OMPL has not found another in {limit:g} s",
-            )
+            reason = f"the straight path is not free, and OMPL has not found another in {limit:g} s"
+            return None, reason
         setup.simplifySolution(limit / 5)
-        states_of_path = setup.getSolutionPath().getStates()
-        corners = units * np.array([_numbers(state, n) for state in states_of_path])
+        path_states = setup.getSolutionPath().getStates()
+        corners = units * np.array([_numbers(state, n) for state in path_states])
         corners[0], corners[-1] = start, end
         if not _is_obstructed(query, corners):
             return corners, "OMPL, RRT-Connect"
     return None, "the paths of OMPL are not free between the postures that it checked"
+
+
+def _search_bounds(robot: ArmHand, start: Array, end: Array, carries: bool) -> tuple[Array, Array]:
+    """Return the bounds (n,) of the postures on a path.
+
+    Args:
+        robot: Robot that moves.
+        start: (n,) first posture.
+        end: (n,) last posture.
+        carries: True if the hand carries an object, so that its posture must not change.
+    """
+    # A continuous joint may take half a turn beyond both ends.
+    is_endless = robot.description.continuous
+    lower = np.where(is_endless, np.minimum(start, end) - np.pi, robot.lower)
+    upper = np.where(is_endless, np.maximum(start, end) + np.pi, robot.upper)
+    if carries:
+        # The interval allows for rounding.
+        is_hand = np.isin(np.arange(len(start)), robot.description.hand_actuators)
+        lower = np.where(is_hand, np.minimum(start, end) - 1e-7, lower)
+        upper = np.where(is_hand, np.maximum(start, end) + 1e-7, upper)
+    return lower, upper
 
 
 def _numbers(state: Any, n: int) -> Array:

@@ -20,7 +20,7 @@ from casadi_ik.files.writing import atomic_write
 from casadi_ik.kinematics.arm_hand import ArmHand
 from casadi_ik.logs.cdr import JOINT_TRAJECTORY, cdr_message, ros_channel, write_postures
 
-CROSSING = 1.0
+CROSSING_TIME = 1.0
 """Time in which a motor without a velocity limit crosses its range [s]."""
 
 RUN_UP = 0.25
@@ -33,7 +33,7 @@ MAX_RATE = 1e12
 
 @dataclass(frozen=True, eq=False)
 class Rates:
-    """Limits of the motors' motion.
+    """Velocity and acceleration limits of the motors.
 
     Attributes:
         velocity: (n,) velocity limits [rad/s or m/s].
@@ -44,15 +44,22 @@ class Rates:
     acceleration: Array
 
     def steps(self, period: float) -> tuple[Array, Array]:
-        """Return the longest step of a cycle, and its largest change, (n,) each."""
+        """Return the longest step of a cycle, and its largest change from cycle to cycle.
+
+        Args:
+            period: Time from cycle to cycle [s].
+
+        Returns:
+            (n,) steps and (n,) changes [rad or m].
+        """
         return self.velocity * period, self.acceleration * period**2
 
 
 def own_velocities(robot: ArmHand) -> Array:
-    """Return the velocity limits (n,) of the description, or range / `CROSSING` if it has none."""
+    """Return the velocity limits (n,) of the description; without one, range / `CROSSING_TIME`."""
     limits = np.array([actuator.velocity for actuator in robot.description.actuators])
     ranges = robot.upper - robot.lower
-    return np.where(np.isfinite(limits), limits, ranges / CROSSING)
+    return np.where(np.isfinite(limits), limits, ranges / CROSSING_TIME)
 
 
 def rates_of(robot: ArmHand, velocity: Any, acceleration: Any) -> Rates:
@@ -152,7 +159,7 @@ def direction_vector(name: str, value: Any) -> Array:
 
 
 def unbounded(robot: ArmHand) -> Rates:
-    """Return limits that are never reached, for cycles of one second."""
+    """Return limits that motors never reach in cycles of one second."""
     limits = 1e6 * np.maximum(robot.upper - robot.lower, 1.0)
     return Rates(limits, limits)
 
@@ -177,6 +184,9 @@ class TimingTuning:
     last_grid_offset: float = 0.1
 
 
+TIMING_TUNING = TimingTuning()
+
+
 def timed(path: Array, rates: Rates, period: float) -> Array:
     """Return samples of a path from rest to rest, timed by TOPP-RA (Pham & Pham 2018).
 
@@ -199,56 +209,18 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
     """
     with optional_import("timing"):
         import toppra
-        from scipy.interpolate import PchipInterpolator
-        from toppra import algorithm, constraint
-        from toppra.simplepath import SimplePath
-    tuning = TimingTuning()
     lengths = np.abs(np.diff(path, axis=0)).sum(axis=0)
     if not lengths.max(initial=0.0) > 1e-9:
         return path[:1]
     toppra.setup_logging("ERROR")
     # Scale time and positions such that all numbers are near 1.
-    duration = max(lengths / rates.velocity) + math.sqrt(max(lengths / rates.acceleration))
-    unit = rates.acceleration * duration**2
-    segment_lengths = np.linalg.norm(np.diff(path / unit, axis=0), axis=1)
-    is_long = segment_lengths > tuning.min_segment * segment_lengths.sum()
-    postures = path[np.append(is_long, True)] / unit
-    segment_lengths = np.linalg.norm(np.diff(postures, axis=0), axis=1)
-    parameters = np.append(0.0, np.cumsum(segment_lengths))
-    parameters /= parameters[-1]
-    slopes = PchipInterpolator(parameters, postures).derivative()(parameters)
-    max_velocity = tuning.limit_share * rates.velocity * duration / unit
-    max_acceleration = np.full(len(unit), tuning.limit_share)
-    both_ends = constraint.DiscretizationType.Interpolation
-    constraints = [
-        constraint.JointVelocityConstraint(np.stack([-max_velocity, max_velocity], axis=1)),
-        constraint.JointAccelerationConstraint(
-            np.stack([-max_acceleration, max_acceleration], axis=1),
-            discretization_scheme=both_ends,
-        ),
-    ]
-    intervals = max(2, math.ceil(tuning.grid / (len(postures) - 1)))
-    regular = np.linspace(0.0, 1.0, intervals, endpoint=False)
-    trajectory: Any = None
-    # The interval before a posture is sometimes too short for the linear programs of TOPP-RA.
-    for shares_of_segment in (
-        np.append(regular, 1.0 - tuning.last_grid_offset / intervals),
-        regular,
-    ):
-        points = parameters[:-1, None] + np.diff(parameters)[:, None] * shares_of_segment
-        grid = np.append(points.ravel(), 1.0)
-        trajectory = algorithm.TOPPRA(
-            constraints,
-            SimplePath(parameters, postures, slopes),
-            gridpoints=grid,
-            parametrizer="ParametrizeConstAccel",
-        ).compute_trajectory()
-        if trajectory is not None:
-            break
-    assert trajectory is not None
-    count = cycle_count(duration * trajectory.duration, period, "period")
+    time_unit = max(lengths / rates.velocity) + math.sqrt(max(lengths / rates.acceleration))
+    units = rates.acceleration * time_unit**2
+    max_velocity = TIMING_TUNING.limit_share * rates.velocity * time_unit / units
+    trajectory = _fastest_trajectory(path / units, max_velocity, TIMING_TUNING.limit_share)
+    count = cycle_count(time_unit * trajectory.duration, period, "period")
     while True:
-        q = unit * trajectory(np.linspace(0.0, trajectory.duration, count + 1))
+        q = units * trajectory(np.linspace(0.0, trajectory.duration, count + 1))
         q = np.clip(q, path.min(axis=0), path.max(axis=0))  # remove rounding errors
         q[0], q[-1] = path[0], path[-1]
         velocity, acceleration = limit_fraction(q, period, rates)
@@ -258,10 +230,57 @@ def timed(path: Array, rates: Rates, period: float) -> Array:
         count = max(count + 1, cycle_count(count * slowdown * period, period, "period"))
 
 
+def _fastest_trajectory(path: Array, max_velocity: Array, max_acceleration: float) -> Any:
+    """Return the fastest trajectory of TOPP-RA from rest to rest, in scaled units.
+
+    Args:
+        path: (k, n) postures.
+        max_velocity: (n,) velocity limits.
+        max_acceleration: Acceleration limit of all motors.
+    """
+    with optional_import("timing"):
+        from scipy.interpolate import PchipInterpolator
+        from toppra import algorithm, constraint
+        from toppra.simplepath import SimplePath
+    tuning = TIMING_TUNING
+    segment_lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    is_long = segment_lengths > tuning.min_segment * segment_lengths.sum()
+    postures = path[np.append(is_long, True)]
+    segment_lengths = np.linalg.norm(np.diff(postures, axis=0), axis=1)
+    parameters = np.append(0.0, np.cumsum(segment_lengths))
+    parameters /= parameters[-1]
+    slopes = PchipInterpolator(parameters, postures).derivative()(parameters)
+    accelerations = np.full(path.shape[1], max_acceleration)
+    both_ends = constraint.DiscretizationType.Interpolation
+    constraints = [
+        constraint.JointVelocityConstraint(np.stack([-max_velocity, max_velocity], axis=1)),
+        constraint.JointAccelerationConstraint(
+            np.stack([-accelerations, accelerations], axis=1), discretization_scheme=both_ends
+        ),
+    ]
+    intervals = max(2, math.ceil(tuning.grid / (len(postures) - 1)))
+    regular = np.linspace(0.0, 1.0, intervals, endpoint=False)
+    with_last_point = np.append(regular, 1.0 - tuning.last_grid_offset / intervals)
+    trajectory: Any = None
+    # The interval before a posture is sometimes too short for the linear programs of TOPP-RA.
+    for segment_grid in (with_last_point, regular):
+        points = parameters[:-1, None] + np.diff(parameters)[:, None] * segment_grid
+        trajectory = algorithm.TOPPRA(
+            constraints,
+            SimplePath(parameters, postures, slopes),
+            gridpoints=np.append(points.ravel(), 1.0),
+            parametrizer="ParametrizeConstAccel",
+        ).compute_trajectory()
+        if trajectory is not None:
+            break
+    assert trajectory is not None
+    return trajectory
+
+
 SUFFIXES = (".npz", ".csv", ".mcap")
 """Suffixes of the file formats of a motion."""
 
-BILLION = 1_000_000_000
+NANOSECONDS_PER_SECOND = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -388,11 +407,14 @@ class Motion(RecordReprMixin):
 
     def _messages(self, writer: Writer) -> None:
         robot, no_efforts = self.robot, np.zeros(0)
-        root, stamps = robot.description.root, np.rint(self.times * BILLION).astype(np.int64)
+        root, stamps = (
+            robot.description.root,
+            np.rint(self.times * NANOSECONDS_PER_SECOND).astype(np.int64),
+        )
         points: list[str | list[str] | Array | tuple[int, int] | int] = []
         rows = zip(stamps.tolist(), self.q, self.velocity, self.acceleration, strict=True)
         for stamp, *values in rows:
-            points += [*values, no_efforts, divmod(stamp, BILLION)]
+            points += [*values, no_efforts, divmod(stamp, NANOSECONDS_PER_SECOND)]
         trajectory = cdr_message((0, 0), root, list(robot.actuators), len(self), *points)
         channel = ros_channel(writer, "/joint_trajectory", JOINT_TRAJECTORY)
         writer.add_message(channel, 0, trajectory, 0)
