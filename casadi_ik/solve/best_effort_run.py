@@ -68,14 +68,23 @@ class BestEffortRun:
         """Return targets for the first restarts; None if restarts may not be omitted.
 
         A preference only ranks answers; it is not part of the first restarts. Required are all
-        restarts of methods without numbered restarts, of palm poses, whose tolerances are not
-        those of the contacts, and of searches without compiled code, which may miss the nearest
-        configuration.
+        restarts of methods without numbered restarts, and of searches without compiled code, which
+        may miss the nearest configuration.
         """
-        has_restarts = self.method.hand_search is not None and self.search.is_compiled
-        if not has_restarts or targets.palms is not None:
+        if self.method.hand_search is None or not self.search.is_compiled:
             return None
         return replace(targets, prefer=DEFAULT_PREFERENCE) if targets.prefers_q0 else targets
+
+    def is_out_of_reach(self, targets: TargetBatch) -> NDArray[np.bool_]:
+        """Return (k,) True where the nearest configuration is far outside the tolerances.
+
+        Without compiled code no target counts as out of reach. Collisions are not considered.
+        """
+        if not self.search.is_compiled:
+            return np.zeros(len(targets), dtype=bool)
+        no_q = np.full((len(targets), len(self.robot.actuators)), np.nan)
+        minima = self.search.solve(targets, no_q, None, BestEffort())
+        return minima.mean_square >= MIN_MEAN_SQUARE * max_mean_square(targets)
 
     def run(
         self,
@@ -138,7 +147,8 @@ class BestEffortRun:
             The outcome; targets that are out of reach have the status NEAREST.
         """
         rows = np.flatnonzero(~solved)
-        outcome = self._with_nearest(targets, rows, outcome, query, BestEffort(), MIN_MEAN_SQUARE)
+        bounds = MIN_MEAN_SQUARE * max_mean_square(targets)
+        outcome = self._with_nearest(targets, rows, outcome, query, BestEffort(), bounds)
         if options != BestEffort():
             rows = np.flatnonzero(outcome.status == Status.NEAREST)
             outcome = self._with_nearest(targets, rows, outcome, query, options)
@@ -154,7 +164,7 @@ class BestEffortRun:
         outcome: Outcome,
         query: CollisionQuery | None,
         options: BestEffort,
-        min_mean_square: float = 0.0,
+        min_mean_square: float | Array = 0.0,
     ) -> Outcome:
         """Return an outcome with the nearest configurations of some targets.
 
@@ -165,15 +175,33 @@ class BestEffortRun:
             query: See `run`.
             options: See `run`.
             min_mean_square: Mean square of the errors of a nearest configuration, divided by their
-                tolerances, below which a target remains unchanged.
+                tolerances, below which a target remains unchanged; one number, or (k,).
         """
         if not len(rows):
             return outcome
         started = time.perf_counter()
+        bounds = np.broadcast_to(min_mean_square, len(targets))[rows]
         q, status, seconds = outcome.q.copy(), outcome.status.copy(), outcome.time.copy()
         group, group_query = targets.rows(rows), None if query is None else query.rows(rows)
         minima = self.search.solve(group, q[rows], group_query, options)
-        is_result = minima.is_free & (minima.mean_square >= min_mean_square)
+        is_result = minima.is_free & (minima.mean_square >= bounds)
         q[rows[is_result]], status[rows[is_result]] = minima.q[is_result], Status.NEAREST
         seconds[rows] += (time.perf_counter() - started) / len(rows)
         return replace(outcome, q=q, status=status, time=seconds)
+
+
+def max_mean_square(targets: TargetBatch) -> Array:
+    """Return the largest mean square (k,) of the contact errors of any solution.
+
+    The errors are divided by their tolerances, so that it is 1 for targets given by contacts. A
+    palm pose within tolerance displaces a contact by the position error of the palm, and by its
+    angle error times the distance of the contact from the palm. It turns both axes of a contact.
+    """
+    if targets.palms is None:
+        return np.ones(len(targets))
+    tolerance, points = targets.largest_tolerance, targets.points
+    distances = np.linalg.norm(points - targets.palms[:, None, :3, 3], axis=2)
+    chord = 2 * np.sin(min(tolerance.angle, np.pi) / 2)
+    errors = (tolerance.position + chord * distances) / targets.position_tolerance
+    turns = tolerance.angle / targets.angle_tolerance
+    return np.fmax(np.nanmax(errors, axis=1) ** 2, 2 * turns.max() ** 2)

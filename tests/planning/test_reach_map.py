@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commands import main
+from scipy.spatial.transform import Rotation
 
 import casadi_ik as ik
 from casadi_ik.planning.reach.check import JointChain, pose_frames
@@ -133,6 +134,22 @@ def test_an_arm_without_a_closed_form_has_witnesses_only():
     assert reach.counts["REACHABLE"] > 0
     with pytest.raises(ik.errors.UnsupportedError, match="meaning"):
         solver.reach_map(BOX, meaning="exact")
+
+
+def test_a_sampled_map_finds_what_the_solver_finds():
+    """Palm poses far from the nearest reachable one are not tried; none of these has a solution."""
+    robot = ik.load_robot("so101")
+    solver, rng = ik.Solver(robot), np.random.default_rng(5)
+    palms = robot.palm(robot.random(rng, 120))
+    turns = np.concatenate([0.9 * np.deg2rad(3.0) * np.ones(60), np.pi * rng.random(60)])
+    axes = rng.normal(size=(120, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    palms[:, :3, :3] = Rotation.from_rotvec(turns[:, None] * axes).as_matrix() @ palms[:, :3, :3]
+    reach = solver.reach_map(palms)
+    solved = solver.solve_palms(palms, robot.home).success
+    np.testing.assert_array_equal(reach.status.ravel() == "REACHABLE", solved)
+    assert solved[:60].all()
+    assert not solved[60:].all()
 
 
 @pytest.mark.parametrize(

@@ -256,10 +256,23 @@ class PalmDecider:
 
     def _solve(self, solver: Any, palms: Array) -> tuple[Bools, Array]:
         """Return (k,) True where the solver reaches palm poses, and the arms (k, a)."""
-        if not len(palms):
-            return np.zeros(0, dtype=bool), np.zeros((0, self.joints))
-        batch = solver.solve_palms(palms, solver.robot.home)
-        return batch.success, batch.q[:, self._columns]
+        is_solved = np.zeros(len(palms), dtype=bool)
+        arms = np.full((len(palms), self.joints), np.nan)
+        rows = np.arange(len(palms))
+        if self._arm is None and len(rows):
+            # The solver needs many restarts without a closed form: 100 times longer.
+            rows = np.flatnonzero(~self._is_out_of_reach(solver, palms))
+        if len(rows):
+            batch = solver.solve_palms(palms[rows], solver.robot.home)
+            is_solved[rows], arms[rows] = batch.success, batch.q[:, self._columns]
+        return is_solved, arms
+
+    def _is_out_of_reach(self, solver: Any, palms: Array) -> Bools:
+        """Return (k,) True where the nearest configuration is far outside the tolerances."""
+        hands = broadcast_postures(solver.robot, solver.robot.home, len(palms))
+        targets = solver._target_builder.from_palms(palms, hands)
+        engine = solver._engine.engine_for(targets)
+        return engine.best_effort_run.is_out_of_reach(targets)
 
 
 class ObjectDecider:
