@@ -78,6 +78,7 @@ class Frames:
         Raises:
             InputError: There are too many cycles.
         """
+        # The last cycle ends after the last frame.
         count = cycle_count(float(self.times[-1]), period, f"{self.path}: times")
         return period * np.arange(1, count + 2, dtype=float)
 
@@ -97,14 +98,15 @@ def read_frames(path: Path, fingers: int, sides: Sequence[str] = ()) -> Frames:
     arrays = read_npz(path, LIMITS.stream_bytes)
     hands = {side_name("keypoints", side): side for side in sides or (None,)}
     keys = [*hands, "normals", "points", "times"]
-    if any(name in arrays for name in hands) == ("points" in arrays):
+    has_keypoints, has_points = any(name in arrays for name in hands), "points" in arrays
+    if has_keypoints == has_points:
         raise InputError(
             f"{path}: expected {' and '.join(hands)} (k, {KEYPOINTS}, 3) or points "
             f"(k, {fingers}, 3); found {', '.join(arrays) or 'nothing'}"
         )
     for name in sorted(set(arrays).difference(keys)):
         raise InputError(f"{path}: {name}: unknown, expected {', '.join(keys)}")
-    if "points" in arrays:
+    if has_points:
         return _read_contacts(path, arrays, fingers)
     keypoints = dict[str | None, Array]()
     for name, side in hands.items():

@@ -3,9 +3,8 @@
 A configuration of about ten lines (`load_retarget`) assigns one of the 21 keypoints to each finger
 (in the common numbering: 0 is the wrist, and 4, 8, 12, 16 and 20 are the tips from the thumb on),
 and sets the scale and the smoothing. The robot starts at its present configuration: only the
-*motion* of wrist and hand counts, so no camera has to be calibrated. Sizes of hands do not depend
-on their
-postures: they follow from a person's bones and from the reach of the robot's fingertips.
+*motion* of wrist and hand counts, so no camera has to be calibrated. The scale does not depend on
+postures: it follows from a person's bones and from the reach of the robot's fingertips.
 """
 
 from __future__ import annotations
@@ -273,7 +272,7 @@ class Retargeter:
             side: _Hand(config, robot, q, side, side_config)
             for side, side_config in config.by_side().items()
         }
-        self._R_base_keypoints: Array | None = None
+        self._R_base_keypoints: Array | None = None  # None before the first frame of all hands
 
     @property
     def in_hand(self) -> bool:
@@ -381,7 +380,9 @@ class Retargeter:
         palms = np.array([hand.palm[:3, 3] for hand in hands])
         # The positions of the hands relative to each other; zero for a single hand.
         pairs.append((wrists - wrists.mean(axis=0), palms - palms.mean(axis=0)))
-        return _aligned(*(np.concatenate(vectors) for vectors in zip(*pairs, strict=True)))
+        return _aligning_rotation(
+            *(np.concatenate(vectors) for vectors in zip(*pairs, strict=True))
+        )
 
 
 class _Hand:
@@ -547,7 +548,7 @@ def _rotation(rpy: tuple[float, float, float]) -> Array:
     return frame_matrix(Frame(rpy=rpy))[:3, :3]
 
 
-def _aligned(tips: Array, robot_tips: Array) -> Array:
+def _aligning_rotation(tips: Array, robot_tips: Array) -> Array:
     """Return the rotation (3, 3) that best aligns fingertips with a robot's (Kabsch 1976)."""
     u, _, v = np.linalg.svd(robot_tips.T @ tips)
     return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
