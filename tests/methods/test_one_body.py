@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_robots import MULTI_ARM_ROBOTS, grasp_at, grasp_of
+from toy_robots import MULTI_ARM_ROBOTS, grasp_at, grasp_of, moved_targets
 
 import casadi_ik as ik
 
@@ -215,11 +215,23 @@ def test_unreachable_side_is_named():
     assert any(line.startswith("left ") for line in solution.diagnosis.lines)
 
 
-def test_without_a_compiler_there_is_an_answer():
-    robot = ik.load_robot("mobile_kuka_lwr_barrett")
-    q = robot.lower + 0.4 * (robot.upper - robot.lower)
-    solution = ik.Solver(robot, compiled=False).solve(grasp(robot, q), q0=q + 0.02)
-    assert solution.status == ik.Status.SOLVED
+@pytest.mark.parametrize("name", ["g1+dex3", "mobile_kuka_lwr_barrett"])
+def test_targets_are_solved_without_a_compiler(name, tmp_path):
+    robot, tolerance = ik.load_robot(name), ik.Tolerance()
+    rng = np.random.default_rng(1005)
+    contacts = robot.contacts(robot.random(rng, 8))
+    moved = moved_targets(contacts, rng, 0.8 * tolerance.position, 0.8 * tolerance.angle)
+    solver, log = ik.Solver(robot, compiled=False), tmp_path / "log.mcap"
+    batch = solver.solve_batch(*moved, log=log)
+    assert np.all(batch.status == ik.Status.SOLVED)
+    assert len(ik.logs.open(log).iterations().array()) == batch.iterations.sum()
+    q = batch.q[0]
+    fixed = {motor: float(q[robot.description.actuator_index(motor)]) for motor in robot.trunk}
+    solution = solver.solve(grasp(robot, q), q0=q, prefer="q0", fixed=fixed)
+    assert solution.success
+    for motor, value in fixed.items():
+        index = robot.description.actuator_index(motor)
+        assert solution.q[index] == pytest.approx(value, abs=1e-12)
 
 
 @pytest.mark.parametrize("method", sorted({*ik.METHODS} - {"hand-first", "ipopt"}))

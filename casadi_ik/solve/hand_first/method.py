@@ -30,6 +30,7 @@ from casadi_ik.solve.hand_first.robot_parts import (
     palm_contacts,
     palm_robot,
     robot_trace,
+    solve_sides_at_trunk_positions,
     solve_sides_independently,
 )
 from casadi_ik.solve.hand_first.search_code import SearchPlan, can_search
@@ -49,7 +50,8 @@ class HandFirstMethod(LoopedMethod):
 
     Each restart has other hand postures as seeds; nearly all targets need one restart only. C code
     decides about restarts (restarts.c), for a batch, a single target and a stepper. Without a
-    compiler there are table restarts only, in CasADi's virtual machine.
+    compiler there are table restarts only, in CasADi's virtual machine, and a multi-arm robot is
+    solved side by side at sampled positions of its trunk, then as one hand.
 
     Attributes:
         step: Graphs of the stages for the robot.
@@ -78,6 +80,7 @@ class HandFirstMethod(LoopedMethod):
             compiled: False: use CasADi's virtual machine.
             kinds: Kinds of the contacts, by finger; None: points with normals.
         """
+        self._description = robot
         robot = robot if compiled else robot.as_hand
         super().__init__(robot, options, compiled)
         self.options: HandFirstParameters = options
@@ -98,7 +101,7 @@ class HandFirstMethod(LoopedMethod):
         """Return the method for contacts of other kinds."""
         if kinds == self._kinds:
             return self
-        return HandFirstMethod(self.robot, self.options, self._compiled, kinds)
+        return HandFirstMethod(self._description, self.options, self._compiled, kinds)
 
     @cached_property
     def is_compiled(self) -> bool:
@@ -122,12 +125,12 @@ class HandFirstMethod(LoopedMethod):
         return self
 
     def in_virtual_machine(self) -> HandFirstMethod:
-        """Return the method without compiled code; a multi-arm robot becomes one hand there."""
-        return HandFirstMethod(self.robot.as_hand, self.options, False, self._kinds)
+        """Return the method without compiled code."""
+        return HandFirstMethod(self._description, self.options, False, self._kinds)
 
     def __reduce__(self) -> tuple[type[HandFirstMethod], tuple[Any, ...]]:
         """Return the arguments of the constructor."""
-        return HandFirstMethod, (self.robot, self.options, self._compiled, self._kinds)
+        return HandFirstMethod, (self._description, self.options, self._compiled, self._kinds)
 
     def prepare(self, batches: bool = False) -> None:
         """Build and compile the kernels of a single target, and fill the table of its seeds.
@@ -174,7 +177,7 @@ class HandFirstMethod(LoopedMethod):
     @cached_property
     def _sides(self) -> list[HandFirstMethod]:
         """Methods of the sides of a multi-arm robot."""
-        robot = self.robot
+        robot = self._description
         return [
             HandFirstMethod(
                 robot.side(side.name),
@@ -205,7 +208,7 @@ class HandFirstMethod(LoopedMethod):
         self._check(targets)
         if not self.is_compiled:
             method = self.in_virtual_machine() if self.robot.sides else self
-            return method._run_from_tables(targets, trace, rounds)
+            return method._run_in_virtual_machine(targets, trace, rounds)
         if self._has_independent_sides:
             return self._run_independent_sides(targets, trace, rounds)
         max_restarts = np.full(len(targets), self._max_restarts(targets))
@@ -275,17 +278,47 @@ class HandFirstMethod(LoopedMethod):
         self, targets: TargetBatch, trace: bool, rounds: int | None
     ) -> Outcome:
         """Solve a multi-arm robot without a trunk."""
-
-        def side_solver(side: HandFirstMethod) -> SideSolver:
-            return lambda side_targets: side.run(side_targets, trace, rounds)
-
         return solve_sides_independently(
             self.robot,
-            list(map(side_solver, self._sides)),
+            self._side_solvers(trace, rounds),
             targets,
             self.step.layouts.labels,
             self.graph.record.dtype if trace else None,
         )
+
+    def _side_solvers(self, trace: bool, rounds: int | None) -> list[SideSolver]:
+        """Return the functions that solve the targets of each side."""
+
+        def side_solver(side: HandFirstMethod) -> SideSolver:
+            return lambda side_targets: side.run(side_targets, trace, rounds)
+
+        return list(map(side_solver, self._sides))
+
+    def _run_in_virtual_machine(
+        self, targets: TargetBatch, trace: bool, rounds: int | None
+    ) -> Outcome:
+        """Solve a batch without compiled code; several arms side by side, then as one hand."""
+        if not self._description.sides:
+            return self._run_from_tables(targets, trace, rounds)
+        outcome = solve_sides_at_trunk_positions(
+            self._description,
+            self._arm_hand,
+            self._side_solvers(trace, rounds=1 if self._description.trunk else rounds),
+            targets,
+            self.step.layouts.labels,
+            self.graph.record.dtype if trace else None,
+            self.rounds if rounds is None else rounds,
+        )
+        rows = np.flatnonzero(outcome.status != Status.SOLVED)
+        if not len(rows):
+            return outcome
+        second = self._run_from_tables(targets.rows(rows), trace, rounds)
+        status = outcome.status.copy()
+        status[rows] = second.status
+        all_rows = np.ones(len(rows), dtype=bool)
+        trace_of_second = second.trace if trace else None
+        outcome = outcome.continued(rows, second.q, all_rows, second, trace_of_second)
+        return replace(outcome, status=status)
 
     def solve_single(self, targets: TargetBatch, rounds: int | None = None) -> SingleOutcome | None:
         """Solve one target as `run` does, but faster; None: use `run`."""
