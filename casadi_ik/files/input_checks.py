@@ -182,7 +182,7 @@ class UsualSizes:
 
 
 MAX_DEGREES = 720.0
-"""Largest limit of a joint that may be meant in degrees; larger ones stand for none."""
+"""Largest limit of a joint that may be meant in degrees; a larger one means no limit."""
 
 USUAL_SIZES = UsualSizes()
 

@@ -202,6 +202,6 @@ def max_mean_square(targets: TargetBatch) -> Array:
     tolerance, points = targets.largest_tolerance, targets.points
     distances = np.linalg.norm(points - targets.palms[:, None, :3, 3], axis=2)
     chord = 2 * np.sin(min(tolerance.angle, np.pi) / 2)
-    errors = (tolerance.position + chord * distances) / targets.position_tolerance
-    turns = tolerance.angle / targets.angle_tolerance
-    return np.fmax(np.nanmax(errors, axis=1) ** 2, 2 * turns.max() ** 2)
+    position_ratios = (tolerance.position + chord * distances) / targets.position_tolerance
+    angle_ratios = tolerance.angle / targets.angle_tolerance
+    return np.fmax(np.nanmax(position_ratios, axis=1) ** 2, 2 * angle_ratios.max() ** 2)

@@ -16,9 +16,9 @@ import casadi_ik as ik
 from casadi_ik.app.drawing import palette
 from casadi_ik.app.drawing.drawables import bodies_at, collision_bodies, visual_bodies
 from casadi_ik.app.drawing.mesh_table import (
-    MeshFileEntry,
     MeshTable,
     PackageEntry,
+    PlacedMeshEntry,
     VisualMeshEntry,
     fetch_repository,
     mesh_table,
@@ -154,7 +154,7 @@ def test_repositories_are_fetched_and_place_meshes(site: Path, tmp_path: Path) -
     git(repository, "add", ".")
     git(repository, "commit", "--quiet", "-m", "boxes")
     commit = git(repository, "rev-parse", "HEAD")
-    files = [MeshFileEntry("meshes/box.stl", (0.0, 0.0, 0.3), (0.0, 0.0, 0.0), "#000000")]
+    files = [PlacedMeshEntry("meshes/box.stl", (0.0, 0.0, 0.3), (0.0, 0.0, 0.0), "#000000")]
     table = MeshTable(
         {"boxes": PackageEntry(repository=repository.as_uri(), commit=commit)},
         {"panda": [VisualMeshEntry("boxes", "MIT", meshes={"panda_link_3": files})]},

@@ -1,4 +1,4 @@
-"""Table of descriptions in packages and repositories whose meshes stand for the built-in robots."""
+"""Table of descriptions in packages and repositories with meshes of the built-in robots."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class PackageEntry(Struct, frozen=True):
     commit: str = ""
 
 
-class MeshFileEntry(Struct, frozen=True):
+class PlacedMeshEntry(Struct, frozen=True):
     """A mesh file of a link.
 
     Attributes:
@@ -81,7 +81,7 @@ class VisualMeshEntry(Struct, frozen=True):
     xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
     zeros: dict[str, float] = {}
-    meshes: dict[str, list[MeshFileEntry]] = {}
+    meshes: dict[str, list[PlacedMeshEntry]] = {}
 
     @property
     def links(self) -> list[str]:
@@ -149,13 +149,13 @@ def find_file(package: str, table: MeshTable, entry: VisualMeshEntry) -> Path | 
 
 def folders(package: str, table: MeshTable) -> list[Path]:
     """Return the folders that may hold the descriptions of a package, the preferred one first."""
-    places = [fetched_folder(package)]
-    places += [Path(clone).expanduser() for clone in table.packages[package].clones]
+    candidate_folders = [fetched_folder(package)]
+    candidate_folders += [Path(clone).expanduser() for clone in table.packages[package].clones]
     if table.packages[package].folder:
         with suppress(metadata.PackageNotFoundError):
             file = metadata.distribution(package).locate_file(table.packages[package].folder)
-            places.insert(0, Path(str(file)))
-    return places
+            candidate_folders.insert(0, Path(str(file)))
+    return candidate_folders
 
 
 def fetched_folder(package: str) -> Path:

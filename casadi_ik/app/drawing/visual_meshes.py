@@ -26,8 +26,8 @@ import numpy as np
 from casadi_ik.app.drawing import MESHES_VARIABLE, palette
 from casadi_ik.app.drawing.mesh_table import (
     HullEntry,
-    MeshFileEntry,
     MeshTable,
+    PlacedMeshEntry,
     VisualMeshEntry,
     candidates,
     covered_links,
@@ -241,7 +241,7 @@ def _entry_meshes(
     return meshes
 
 
-def _posed_parts(root: Path, entry: MeshFileEntry) -> list[ColoredMesh]:
+def _posed_parts(root: Path, entry: PlacedMeshEntry) -> list[ColoredMesh]:
     """Return the meshes of a file in the frame of a link."""
     pose = frame_matrix(Frame(entry.xyz, entry.rpy))
     parts = read_mesh_parts(root / entry.file, str(root / entry.file))

@@ -226,10 +226,10 @@ class PalmDecider:
                 is_refuted = self._arm.refute_within(poses[remaining], self._tolerance)
                 code[remaining[is_refuted]] = Reachability.UNREACHABLE
         if self._solver.scene is not None:
-            reached = np.flatnonzero(code == Reachability.REACHABLE)
-            is_free, arms = self._without_collisions(poses[reached], witnesses[reached])
-            code[reached[~is_free]] = Reachability.COLLIDING
-            witnesses[reached] = np.where(is_free[:, None], arms, np.nan)
+            rows = np.flatnonzero(code == Reachability.REACHABLE)
+            is_free, arms = self._without_collisions(poses[rows], witnesses[rows])
+            code[rows[~is_free]] = Reachability.COLLIDING
+            witnesses[rows] = np.where(is_free[:, None], arms, np.nan)
         return code, witnesses
 
     def _without_collisions(self, palms: Array, arms: Array) -> tuple[Bools, Array]:

@@ -211,11 +211,11 @@ def _solver_in_scene(solver: Any, scene: Scene, lower: Array, upper: Array) -> A
     problem = ""
     for fraction in spread_points(count, 4):
         base = lower + fraction * (upper - lower)
-        seen = scene
+        scene_in_base = scene
         for name, item in scene.items.items():
-            seen = seen.moved(name, _in_base(item.pose, base))
+            scene_in_base = scene_in_base.moved(name, _in_base(item.pose, base))
         try:
-            return with_scene(solver, seen)
+            return with_scene(solver, scene_in_base)
         except DescriptionError as error:
             problem = str(error)
     raise InputError(
@@ -261,7 +261,7 @@ class BaseScore:
 
     def reach(self, base: Array) -> tuple[Bools, Array]:
         """Return (k,) True for the palm poses that a base reaches, and the arms (k, a) [rad]."""
-        solver = self._moved(base)
+        solver = self._solver_at(base)
         if solver is None:
             count = len(self._palms), len(self._reach.lower)
             return np.zeros(count[0], dtype=bool), np.full(count, np.nan)
@@ -270,9 +270,9 @@ class BaseScore:
 
     def stands_free(self, base: Array) -> bool:
         """Return True if a base does not touch an obstacle."""
-        return self._moved(base) is not None
+        return self._solver_at(base) is not None
 
-    def _moved(self, base: Array) -> Any:
+    def _solver_at(self, base: Array) -> Any:
         """Return the solver with the scene as seen from a base; None if an obstacle touches it."""
         solver = self._solver
         try:
@@ -316,8 +316,10 @@ def _palm_pose(solver: Any, grasp: Any, row: int) -> Array:
     world = np.eye(4)
     world[:3, 3] = np.mean([contact.point for contact in grasp.contacts.values()], axis=0)
     corners = reachable_box(solver.robot)
-    turns = (np.pi,) * 3
-    free = Free((*corners[0].tolist(), *np.negative(turns)), (*corners[1].tolist(), *turns))
+    half_turns = (np.pi,) * 3
+    free = Free(
+        (*corners[0].tolist(), *np.negative(half_turns)), (*corners[1].tolist(), *half_turns)
+    )
     contacts = Grasp(grasp.contacts).at(inverse(world)).contacts
     solution = with_scene(solver, None).solve(Grasp(contacts, object_pose=free))
     if not solution.success:
